@@ -1,0 +1,39 @@
+# Every target sets up .venv first. A Python >= 3.12 is enough; `uv` is used when it is there and installed into .venv when not.
+.PHONY: demo test lint type format lock clean
+
+BIN := .venv/bin
+READY := .venv/ready
+
+demo: $(READY)
+	$(BIN)/lfd demo --out outputs/demo --overwrite
+
+test: lint type
+	$(BIN)/pytest
+
+lint: $(READY)
+	$(BIN)/ruff format --check && $(BIN)/ruff check && $(BIN)/lint-imports
+
+type: $(READY)
+	$(BIN)/pyright
+
+format: $(READY)
+	$(BIN)/ruff format && $(BIN)/ruff check --fix
+
+lock: $(READY)
+	$(UV) pip compile --quiet --no-emit-index-url --no-header --python-version 3.12 --extra dev pyproject.toml --output-file requirements.lock
+
+clean:
+	rm -rf .venv outputs
+
+$(READY): pyproject.toml requirements.lock .python-version
+	test -d .venv || uv venv --quiet --python 3.12 .venv 2>/dev/null || $(PYTHON) -m venv .venv
+	command -v uv >/dev/null || test -x $(BIN)/uv || $(BIN)/python -m pip install --quiet uv
+	VIRTUAL_ENV=.venv $(UV) pip install --quiet --no-deps -r requirements.lock
+	VIRTUAL_ENV=.venv $(UV) pip install --quiet --no-deps --editable .
+	touch $(READY)
+
+# The first Python of at least 3.12; the message below is all that is run when there is none.
+PYTHON = $(or $(shell for p in python3 python3.12 python3.13 python3.14; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 12))' 2>/dev/null && echo $$p && break; done), \
+	$(error lfd needs Python 3.12 or newer, or uv, which brings one: neither was found))
+UV = $(shell command -v uv || echo $(BIN)/uv)

@@ -1,0 +1,1 @@
+"""Recordings to LeRobot datasets, and the proof that nothing was lost on the way."""

@@ -1,0 +1,101 @@
+"""The table of channels: what is measured, in which unit and frame, and where each format keeps it.
+
+MCAP topics, LeRobot features and Rerun paths are derived from the rows below and written nowhere else.
+A channel's numbers at one time are a vector; the names of its components (joints, axes) come from the
+world and are stored beside the data as `labels`.
+"""
+
+from dataclasses import dataclass
+
+from lfd.core.errors import UnknownName
+
+JOINT_STATE = "sensor_msgs/msg/JointState"
+POSE = "geometry_msgs/msg/PoseStamped"
+ARRAY = "std_msgs/msg/Float64MultiArray"
+
+STATE = "observation.state"
+ENVIRONMENT_STATE = "observation.environment_state"
+
+XYZ = ("x", "y", "z")
+WXYZ = ("w", "x", "y", "z")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Channel:
+    """One row of the table."""
+
+    name: str
+    """Key in an observation; `{object}` stands for the name of an object of the task."""
+    meaning: str
+    """What the numbers are."""
+    unit: str
+    """Unit of the numbers; `controller` means the input range of the robot's controller."""
+    frame: str
+    """Frame in which they are expressed."""
+    topic: str
+    """MCAP topic."""
+    schema: str
+    """ROS 2 message type on that topic."""
+    field: str
+    """Field of the message."""
+    feature: str | None
+    """LeRobot feature that a dataset puts it into when its recipe lists the channel."""
+    path: str
+    """Rerun entity of its plot."""
+
+    def of(self, name: str) -> "Channel":
+        """This row with `{object}` filled in, for the channel called `name`."""
+        part = name.removesuffix(self.name.removeprefix("{object}")) if self.name != name else ""
+        filled = {key: value.replace("{object}", part) for key, value in vars(self).items() if value}
+        return Channel(**{**vars(self), **filled})
+
+
+def _row(
+    name: str, meaning: str, unit: str, frame: str, topic: str, schema: str, field: str, feature: str | None, path: str
+) -> Channel:
+    return Channel(
+        name=name, meaning=meaning, unit=unit, frame=frame, topic=topic, schema=schema, field=field,
+        feature=feature, path=path,
+    )  # fmt: skip
+
+
+# fmt: off
+CHANNELS: dict[str, Channel] = {row.name: row for row in (
+    _row("joint_pos", "arm joint positions", "rad", "joint", "/joint_states", JOINT_STATE, "position", STATE, "plots/joints/position"),
+    _row("joint_vel", "arm joint velocities", "rad/s", "joint", "/joint_states", JOINT_STATE, "velocity", STATE, "plots/joints/velocity"),
+    _row("joint_effort", "torques of the arm's actuators", "N m", "joint", "/joint_states", JOINT_STATE, "effort", STATE, "plots/joints/effort"),
+    _row("gripper_pos", "finger joint positions", "m", "joint", "/joint_states", JOINT_STATE, "position", STATE, "plots/gripper/position"),
+    _row("gripper_vel", "finger joint velocities", "m/s", "joint", "/joint_states", JOINT_STATE, "velocity", STATE, "plots/gripper/velocity"),
+    _row("gripper_effort", "forces of the gripper's actuators", "N", "joint", "/joint_states", JOINT_STATE, "effort", STATE, "plots/gripper/effort"),
+    _row("ee_pos", "position of the grip site", "m", "world", "/ee_pose", POSE, "position", STATE, "plots/ee/position"),
+    _row("ee_quat", "orientation of the grip site, wxyz", "1", "world", "/ee_pose", POSE, "orientation", STATE, "plots/ee/orientation"),
+    _row("{object}_pos", "position of an object's body", "m", "world", "/objects/{object}/pose", POSE, "position", ENVIRONMENT_STATE, "plots/objects/{object}/position"),
+    _row("{object}_quat", "orientation of an object's body, wxyz", "1", "world", "/objects/{object}/pose", POSE, "orientation", ENVIRONMENT_STATE, "plots/objects/{object}/orientation"),
+    _row("sim_state", "MuJoCo's mjSTATE_INTEGRATION", "mixed", "model", "/sim/state", ARRAY, "data", None, ""),
+    _row("action", "action that was applied", "controller", "controller", "/action", ARRAY, "data", "action", "plots/action/applied"),
+    _row("expert_action", "action that the expert proposed", "controller", "controller", "/expert/action", ARRAY, "data", "expert_action", "plots/action/expert"),
+    _row("reward", "reward of the step", "1", "task", "/step", ARRAY, "reward", "next.reward", "plots/step/reward"),
+    _row("success", "success after the step", "bool", "task", "/step", ARRAY, "success", "next.success", "plots/step/success"),
+    _row("done", "the episode ended with the step", "bool", "task", "/step", ARRAY, "done", "next.done", "plots/step/done"),
+    _row("intervention", "a person or an expert overruled the policy", "bool", "task", "/step", ARRAY, "intervention", "intervention", "plots/step/intervention"),
+)}
+# fmt: on
+
+
+def channel(name: str) -> Channel:
+    """The row of the channel called `name`, objects filled in: `channel("cube_pos").topic` is `/objects/cube/pose`.
+
+    Raises `UnknownName` for a name that no row matches.
+    """
+    if name in CHANNELS and "{object}" not in name:
+        return CHANNELS[name]
+    for template in ("{object}_pos", "{object}_quat"):
+        suffix = template.removeprefix("{object}")
+        if name.endswith(suffix) and len(name) > len(suffix):
+            return CHANNELS[template].of(name)
+    raise UnknownName("channel", name, CHANNELS)
+
+
+def object_names(names: list[str]) -> list[str]:
+    """Names of the objects whose position is among the channels `names`, in order."""
+    return [n.removesuffix("_pos") for n in names if n.endswith("_pos") and n not in CHANNELS]

@@ -1,0 +1,1 @@
+"""What goes round through several stages: short files that call them in order."""

@@ -1,0 +1,79 @@
+"""The whole thread once: record, convert, train, evaluate, replay."""
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from lfd.convert.to_lerobot import convert
+from lfd.core.artifact import check_output, write_json, write_manifest
+from lfd.core.protocols import Progress, silent
+from lfd.core.recipe import build, load_toml
+from lfd.record.demonstrations import RecordRecipe, record
+from lfd.replay.clip import clip_of
+from lfd.replay.rerun_scene import replay
+from lfd.replay.verify import verify_replay
+from lfd.run.evaluate import EvalRecipe, evaluate
+from lfd.train.behavior_cloning import TrainRecipe, train
+
+
+def demo(
+    dataset_recipe: Path, policy_recipe: Path, out: Path, *, overwrite: bool = False, progress: Progress = silent
+) -> dict[str, Any]:
+    """Make a policy from a dataset recipe and a policy recipe; everything lands in the folder `out`.
+
+    Returns what `report.json` holds: success rate with its interval, episodes, and seconds of each stage.
+    """
+    check_output(out, overwrite=overwrite)
+    data = load_toml(dataset_recipe, ("record", "convert"))
+    learn = load_toml(policy_recipe, ("policy", "train", "eval"))
+    recipes = {
+        "record": build(RecordRecipe, data.get("record", {}), f"{dataset_recipe} [record]"),
+        "train": build(TrainRecipe, learn.get("train", {}), f"{policy_recipe} [train]"),
+        "eval": build(EvalRecipe, learn.get("eval", {}), f"{policy_recipe} [eval]"),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    write_manifest(out, kind="demo", recipe=data | learn, parents={}, seed=recipes["record"].seed)
+    seconds: dict[str, float] = {}
+    began = time.perf_counter()
+
+    def lap(stage: str) -> None:
+        seconds[stage] = round(time.perf_counter() - began - sum(seconds.values()), 2)
+
+    recordings, dataset, policy, run = (out / name for name in ("recordings", "dataset", "policy", "run"))
+    options: dict[str, Any] = {"overwrite": overwrite, "progress": progress}
+    recorded = record(recipes["record"], recordings, tables=data, **options)
+    lap("record")
+    converted = convert([recordings], dataset, **options)
+    lap("convert")
+    trained = train(learn.get("policy", {}), recipes["train"], dataset, policy, tables=learn, **options)
+    lap("train")
+    report = evaluate(policy, recipes["eval"], run, **options)
+    lap("eval")
+    with progress("replay", 3) as bar:
+        replay(clip_of(recordings, 0), save=out / "demonstration.rrd")
+        bar.advance(note="demonstration.rrd")
+        replay(clip_of(run, 0), save=out / "rollout.rrd")
+        bar.advance(note="rollout.rrd")
+        verified = verify_replay(sorted(recordings.glob("*.mcap"))[0])
+        bar.advance(note=f"deviation {verified.deviation}")
+    lap("replay")
+    measured = {
+        "success_rate": report.success_rate,
+        "interval": list(report.interval),
+        "episodes": report.episodes,
+        "mean_steps": report.mean_steps,
+        "demonstrations": recorded.episodes,
+        "failed_attempts": recorded.failures,
+        "frames": converted.frames,
+        "numbers_compared": converted.compared,
+        "training": asdict(trained),
+        "replay_deviation": verified.deviation,
+        "control_steps_per_second": {
+            "record": round(recorded.steps / seconds["record"], 1),
+            "eval": round(report.mean_steps * report.episodes / seconds["eval"], 1),
+        },
+        "seconds": seconds,
+    }
+    write_json(out / "report.json", measured)
+    return measured

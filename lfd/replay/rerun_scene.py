@@ -1,0 +1,183 @@
+"""Clips in Rerun. The only module that imports rerun.
+
+Meshes are logged once, without time; what moves are the transforms of their bodies, sent as columns.
+"""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from lfd.core.errors import OutputError
+from lfd.core.rotations import xyzw_from_wxyz
+from lfd.replay.clip import Clip
+
+VISUAL_GROUP = 1  # robosuite's group of the geoms that are meant to be seen
+SHAPES = mujoco.mjtGeom
+HIDDEN = ("wall", "floor")
+FIRST_PLOTS = ("plots/action/applied", "plots/joints/position", "plots/gripper/position")
+PATH_COLORS = {"ee": (60, 130, 246)}
+OBJECT_COLOR = (234, 88, 12)
+
+
+def replay(clip: Clip, *, save: Path | None) -> None:
+    """Write a clip to the file `save`, or open the viewer.
+
+    Raises `OutputError` when the file cannot be written.
+    """
+    recording = rr.RecordingStream("lfd", recording_id=clip.title)
+    if save is None:
+        recording.spawn()
+    else:
+        try:
+            save.parent.mkdir(parents=True, exist_ok=True)
+            with save.open("wb"):
+                pass
+        except OSError as error:
+            raise OutputError(f"cannot write {save}: {error.strerror}; choose another --save") from error
+        recording.save(save)
+    recording.send_recording_name(clip.title)
+    recording.send_blueprint(_blueprint(clip))
+    if clip.model is not None and clip.qpos is not None:
+        _log_shapes(recording, clip.model)
+        _log_motion(recording, clip.model, clip.qpos, clip.times)
+    _log_paths(recording, clip)
+    _log_curves(recording, clip)
+    recording.flush()
+    if save is not None:
+        recording.disconnect()
+
+
+def _blueprint(clip: Clip) -> rrb.Blueprint:
+    def view(path: str) -> rrb.TimeSeriesView:
+        unit = clip.curves[path].unit
+        return rrb.TimeSeriesView(name=path.removeprefix("plots/") + (f" [{unit}]" if unit else ""), origin=path)
+
+    first = [path for path in FIRST_PLOTS if path in clip.curves]
+    others = [path for path in clip.curves if path not in first]
+    scene = rrb.Spatial3DView(
+        name="scene",
+        origin="world",
+        background=(245, 245, 245),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(position=(1.05, -0.85, 1.45), look_target=(-0.15, 0.05, 0.9)),
+    )
+    return rrb.Blueprint(
+        rrb.Horizontal(scene, rrb.Vertical(*map(view, first), rrb.Tabs(*map(view, others))), column_shares=[3, 2]),
+        rrb.TimePanel(timeline="time", state="collapsed"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+    )
+
+
+def _log_shapes(recording: rr.RecordingStream, model: mujoco.MjModel) -> None:
+    for index in range(model.ngeom):
+        geom = model.geom(index)
+        color = _color(model, index)
+        if geom.group[0] != VISUAL_GROUP or color[3] == 0 or geom.name.startswith(HIDDEN):
+            continue
+        shape = _shape(model, index, color)
+        if shape is None:
+            continue
+        path = f"world/{_body_name(model, geom.bodyid[0])}/{geom.name or index}"
+        pose = rr.Transform3D(translation=geom.pos, quaternion=rr.Quaternion(xyzw=xyzw_from_wxyz(geom.quat)))
+        recording.log(path, pose, shape, static=True)
+
+
+def _shape(model: mujoco.MjModel, index: int, color: np.ndarray) -> rr.AsComponents | None:
+    geom = model.geom(index)
+    kind, size = geom.type[0], geom.size
+    if kind == SHAPES.mjGEOM_MESH:
+        mesh = model.mesh(geom.dataid[0])
+        vertices = model.mesh_vert[mesh.vertadr[0] : mesh.vertadr[0] + mesh.vertnum[0]]
+        faces = model.mesh_face[mesh.faceadr[0] : mesh.faceadr[0] + mesh.facenum[0]]
+        return rr.Mesh3D(
+            vertex_positions=vertices,
+            triangle_indices=faces,
+            vertex_normals=vertex_normals(vertices, faces),
+            albedo_factor=color,
+        )
+    solid = rr.components.FillMode.Solid
+    if kind == SHAPES.mjGEOM_BOX:
+        return rr.Boxes3D(half_sizes=[size], colors=[color], fill_mode=solid)
+    if kind in (SHAPES.mjGEOM_SPHERE, SHAPES.mjGEOM_ELLIPSOID):
+        radii = size if kind == SHAPES.mjGEOM_ELLIPSOID else np.full(3, size[0])
+        return rr.Ellipsoids3D(half_sizes=[radii], colors=[color], fill_mode=solid)
+    if kind == SHAPES.mjGEOM_CYLINDER:
+        return rr.Cylinders3D(lengths=[2 * size[1]], radii=[size[0]], colors=[color], fill_mode=solid)
+    if kind == SHAPES.mjGEOM_CAPSULE:
+        return rr.Capsules3D(
+            lengths=[2 * size[1]], radii=[size[0]], translations=[(0, 0, -size[1])], colors=[color], fill_mode=solid
+        )
+    return None  # planes and height fields have no edge to draw
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Unit normals of a mesh's vertices: the mean of the faces around each, weighted by area."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros(vertices.shape)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], across)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+
+
+def _color(model: mujoco.MjModel, index: int) -> np.ndarray:
+    """Colour of a geom, 0 to 255: its material's, times the mean of the texture, which Rerun does not get."""
+    material = model.geom(index).matid[0]
+    if material < 0:
+        return (model.geom(index).rgba * 255).astype(np.uint8)
+    color = model.mat_rgba[material].copy()
+    texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB]
+    if texture >= 0:
+        size = model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
+        start = model.tex_adr[texture]
+        pixels = model.tex_data[start : start + size].reshape(-1, model.tex_nchannel[texture])
+        color[:3] *= pixels[:, :3].mean(axis=0) / 255
+    return (color * 255).astype(np.uint8)
+
+
+def _body_name(model: mujoco.MjModel, body: int) -> str:
+    return model.body(body).name or str(body)
+
+
+def _log_motion(recording: rr.RecordingStream, model: mujoco.MjModel, qpos: np.ndarray, times: np.ndarray) -> None:
+    data = mujoco.MjData(model)
+    position = np.empty((len(qpos), model.nbody, 3))
+    orientation = np.empty((len(qpos), model.nbody, 4))
+    for row, posture in enumerate(qpos):
+        data.qpos[:] = posture
+        mujoco.mj_kinematics(model, data)
+        position[row], orientation[row] = data.xpos, data.xquat
+    for body in range(1, model.nbody):
+        moves = np.ptp(position[:, body], axis=0).any() or np.ptp(orientation[:, body], axis=0).any()
+        rows = slice(None) if moves else slice(1)
+        recording.send_columns(
+            f"world/{_body_name(model, body)}",
+            indexes=_clock(times[rows]),
+            columns=rr.Transform3D.columns(
+                translation=position[rows, body], quaternion=xyzw_from_wxyz(orientation[rows, body])
+            ),
+        )
+
+
+def _log_paths(recording: rr.RecordingStream, clip: Clip) -> None:
+    for name, path in clip.positions.items():
+        color = PATH_COLORS.get(name, OBJECT_COLOR)
+        recording.log(f"world/paths/{name}", rr.LineStrips3D([path], colors=[color], radii=[0.002]), static=True)
+        recording.send_columns(
+            f"world/paths/{name}/now", indexes=_clock(clip.times), columns=rr.Points3D.columns(positions=path)
+        )
+        recording.log(f"world/paths/{name}/now", rr.Points3D.from_fields(radii=[0.006], colors=[color]), static=True)
+
+
+def _log_curves(recording: rr.RecordingStream, clip: Clip) -> None:
+    for path, curve in clip.curves.items():
+        recording.log(path, rr.SeriesLines(names=list(curve.names)), static=True)
+        recording.send_columns(path, indexes=_clock(clip.times), columns=rr.Scalars.columns(scalars=curve.values))
+
+
+def _clock(times: np.ndarray) -> list[rr.TimeColumn]:
+    return [rr.TimeColumn("time", duration=times), rr.TimeColumn("step", sequence=np.arange(len(times)))]

@@ -1,0 +1,1 @@
+"""Policies to reports: evaluation with intervals."""

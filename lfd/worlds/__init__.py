@@ -1,0 +1,1 @@
+"""Where behaviour happens: robots, tasks, the robosuite world and the one closed loop."""
