@@ -5,11 +5,9 @@ from typing import Any
 
 from lfd.core.artifact import read_manifest
 from lfd.core.errors import InputError
-from lfd.core.recipe import load_toml
+from lfd.core.recipe import as_table, build, describe, load_toml
 from lfd.record.episode_file import BEGIN, END, read_episode
 from lfd.record.mcap_file import SUFFIX, read_mcap
-
-TABLES = ("robot", "record", "convert", "policy", "train", "eval")
 
 
 def about(path: Path) -> dict[str, Any]:
@@ -20,8 +18,7 @@ def about(path: Path) -> dict[str, Any]:
     if path.suffix == SUFFIX:
         return _about_recording(path)
     if path.suffix == ".toml":
-        tables = load_toml(path, TABLES)
-        return {"kind": "recipe"} | {f"{t}.{key}": value for t, keys in tables.items() for key, value in keys.items()}
+        return _about_recipe(path)
     if not path.is_dir():
         raise InputError(f"nothing that lfd knows at {path}; give a recording, recipe, dataset, policy or run")
     manifest = read_manifest(path)
@@ -41,6 +38,31 @@ def about(path: Path) -> dict[str, Any]:
     return facts
 
 
+def _about_recipe(path: Path) -> dict[str, Any]:
+    """Every key that the recipe's tables know, with its value and its meaning."""
+    from lfd.convert.features import ConvertRecipe
+    from lfd.policies.registry import recipe_class
+    from lfd.record.demonstrations import RecordRecipe
+    from lfd.run.evaluate import EvalRecipe
+    from lfd.train.behavior_cloning import TrainRecipe
+    from lfd.worlds.robots import RobotConfig
+
+    kinds: dict[str, type] = {
+        "robot": RobotConfig,
+        "record": RecordRecipe,
+        "convert": ConvertRecipe,
+        "train": TrainRecipe,
+        "eval": EvalRecipe,
+    }
+    facts: dict[str, Any] = {"kind": "recipe"}
+    for name, table in load_toml(path, (*kinds, "policy")).items():
+        kind = kinds[name] if name != "policy" else recipe_class(table, f"{path} [policy]")
+        values = as_table(build(kind, table, f"{path} [{name}]"))
+        meanings = describe(kind)
+        facts |= {f"{name}.{key}": {"value": value, "meaning": meanings[key]} for key, value in values.items()}
+    return facts
+
+
 def _about_recording(path: Path) -> dict[str, Any]:
     content = read_mcap(path)
     facts: dict[str, Any] = {"kind": "recording", "bytes": path.stat().st_size}
@@ -53,6 +75,7 @@ def _about_recording(path: Path) -> dict[str, Any]:
         facts |= {key: getattr(episode.metadata, key) for key in keys}
         facts |= dict(content.metadata[END])
     for topic, messages in sorted(content.messages.items()):
-        rate = (len(messages) - 1) / seconds if seconds and len(messages) > 1 else 0.0
-        facts[f"topic {topic}"] = f"{len(messages)} messages, {rate:.1f} Hz"
+        span = (messages[-1][0] - messages[0][0]) / 1e9
+        rate = f", {(len(messages) - 1) / span:.1f} Hz" if span > 0 else ""
+        facts[f"topic {topic}"] = f"{len(messages)} messages{rate}"
     return facts

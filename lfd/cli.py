@@ -72,13 +72,15 @@ def _show(title: str, result: Result) -> None:
 
     rows = {}
     for key, value in result.items():
-        if isinstance(value, dict):
+        if isinstance(value, dict) and "meaning" in value:
+            value = f"{value['value']}\n{value['meaning']}"
+        elif isinstance(value, dict):
             value = ", ".join(f"{k} {v}" for k, v in value.items())
         elif isinstance(value, float):
             value = f"{value:.4g}"
         elif isinstance(value, (list, tuple)):
             value = ", ".join(f"{v:.3f}" if isinstance(v, float) else str(v) for v in value)
-        rows[key.replace("_", " ")] = value
+        rows[key] = value
     print_table(f"lfd {title}", rows)
 
 
@@ -154,7 +156,7 @@ def _replay(given: argparse.Namespace) -> Result:
         found["failed"] = found["deviation"] > 0
         return found
     clip = clip_of(given.source, given.episode)
-    replay(clip, save=given.save)
+    replay(clip, save=given.save, overwrite=given.overwrite)
     shown = {"saved": str(given.save), "bytes": given.save.stat().st_size} if given.save else {"viewer": "opened"}
     return {"episode": clip.title, "seconds": float(clip.times[-1]), **shown}
 
@@ -277,6 +279,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--episode", type=int, default=0, metavar="I", help="episode of a folder (default: 0)")
     made.add_argument("--save", type=Path, metavar="X.rrd", help="write a Rerun file instead of opening the viewer")
+    made.add_argument("--overwrite", action="store_true", help="replace the file of --save if it exists")
     made.add_argument(
         "--verify", action="store_true",
         help="instead of showing, execute the actions again and report the largest deviation; exit code 1 unless 0",

@@ -14,6 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
 
 
 class _Bar:
@@ -44,5 +45,5 @@ def print_table(title: str, rows: Mapping[str, object]) -> None:
     """Names and values, one a line."""
     table = Table(title=title, show_header=False, title_justify="left")
     for name, value in rows.items():
-        table.add_row(name, str(value))
+        table.add_row(Text(name), Text(str(value)))  # as they are: "[s]" is a unit, no markup
     Console().print(table)

@@ -1,6 +1,6 @@
 """An episode: one demonstration or rollout, xi = ((x_0, u_0), (x_1, u_1), ..., x_T).
 
-T actions stand between T + 1 observations; row t of `actions` was chosen in row t of the observations, row t
+T actions stand between T1 = T + 1 observations; row t of `actions` was chosen in row t of the observations, row t
 of `rewards` and `successes` was measured after it. Arrays are float64 and read-only.
 """
 
@@ -55,9 +55,9 @@ class Episode:
     does not increase.
     """
 
-    times: Float[np.ndarray, "T+1"]
+    times: Float[np.ndarray, "T1"]
     """Time of each observation since the first [s]."""
-    observations: Mapping[str, Float[np.ndarray, "T+1 _"]]
+    observations: Mapping[str, Float[np.ndarray, "T1 _"]]
     """Channel name to its values, in the channel's unit and frame (`lfd.core.channels`)."""
     actions: Float[np.ndarray, "T Da"]
     """Actions applied, in the controller's input range."""
@@ -69,7 +69,7 @@ class Episode:
     """Whether a person or expert overruled the policy in the step."""
     expert_actions: Float[np.ndarray, "T Da"] | None = None
     """What the expert proposed, where it was asked."""
-    sim_states: Float[np.ndarray, "T+1 _"] | None = None
+    sim_states: Float[np.ndarray, "T1 _"] | None = None
     """MuJoCo's integration state at each observation."""
     labels: Mapping[str, tuple[str, ...]]
     """Names of the components of each observation channel and of `action`."""

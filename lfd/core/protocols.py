@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -53,6 +53,7 @@ class StepResult:
     success: bool
 
 
+@runtime_checkable
 class World(Protocol):
     """Where behaviour happens."""
 
@@ -90,6 +91,7 @@ class Decision:
     """Whether a person or expert overruled the policy."""
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Anything that acts: u_t = pi(x_t)."""
 
@@ -113,6 +115,7 @@ class Transition:
     done: bool
 
 
+@runtime_checkable
 class Observer(Protocol):
     """Watches a rollout: records, counts, streams."""
 
@@ -129,12 +132,14 @@ class Observer(Protocol):
         ...
 
 
+@runtime_checkable
 class Bar(Protocol):
     """A running progress bar."""
 
     def advance(self, amount: int = 1, note: str = "") -> None: ...
 
 
+@runtime_checkable
 class Progress(Protocol):
     """Opens a progress bar for a long stage."""
 

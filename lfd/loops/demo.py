@@ -51,9 +51,9 @@ def demo(
     report = evaluate(policy, recipes["eval"], run, **options)
     lap("eval")
     with progress("replay", 3) as bar:
-        replay(clip_of(recordings, 0), save=out / "demonstration.rrd")
+        replay(clip_of(recordings, 0), save=out / "demonstration.rrd", overwrite=overwrite)
         bar.advance(note="demonstration.rrd")
-        replay(clip_of(run, 0), save=out / "rollout.rrd")
+        replay(clip_of(run, 0), save=out / "rollout.rrd", overwrite=overwrite)
         bar.advance(note="rollout.rrd")
         verified = verify_replay(sorted(recordings.glob("*.mcap"))[0])
         bar.advance(note=f"deviation {verified.deviation}")

@@ -34,16 +34,24 @@ POLICIES = {
 """Type to (recipe, LeRobot's config, policy, maker of the processors)."""
 
 
+def recipe_class(table: dict[str, Any], where: str) -> type[BcMlpRecipe]:
+    """The dataclass of a `[policy]` table, by its `type`.
+
+    Raises `UnknownName` for a type that does not exist.
+    """
+    kind = table.get("type", "")
+    if kind not in POLICIES:
+        raise UnknownName(f"policy type in {where}:", str(kind), POLICIES)
+    return POLICIES[kind][0]
+
+
 def make_policy(table: dict[str, Any], frames: Frames, device: str, where: str) -> tuple[Any, Any, Any]:
     """An untrained policy for a dataset, and its pre- and post-processor.
 
     Raises `UnknownName` for a type that does not exist, `RecipeError` for keys that do not fit it.
     """
-    kind = table.get("type", "")
-    if kind not in POLICIES:
-        raise UnknownName(f"policy type in {where}:", str(kind), POLICIES)
-    recipe_class, config_class, policy_class, make_processors = POLICIES[kind]
-    recipe = build(recipe_class, table, where)
+    recipe = build(recipe_class(table, where), table, where)
+    _, config_class, policy_class, make_processors = POLICIES[recipe.type]
     shapes = {name: tuple(rows.shape[1:]) for name, rows in frames.columns.items()}
     inputs = {name: shape for name, shape in shapes.items() if name != "action"}
     config = config_class(

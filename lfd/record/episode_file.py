@@ -226,7 +226,7 @@ def recordings_in(sources: list[Path]) -> list[Path]:
         if not inside:
             raise RecordingError(f"{source} holds no {SUFFIX} file; `lfd record RECIPE --out {source}` makes some")
         found += inside
-    return found
+    return list({path.resolve(): path for path in found}.values())  # a file and its folder may both be given
 
 
 def recording_in(source: Path, index: int) -> Path:

@@ -7,7 +7,8 @@ whole file. Chunks are flushed every half second: what a crash can lose.
 import os
 import struct
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,23 +55,23 @@ class McapWriter:
         self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[message_type], dict(about))
 
     def message(self, topic: str, time_ns: int, data: bytes) -> None:
-        try:
+        with self._writing():
             self._writer.add_message(self._channels[topic], time_ns, data, time_ns)
             if time.monotonic() - self._flushed > FLUSH_S:
                 self._writer.flush()
                 self._flushed = time.monotonic()
-        except OSError as error:
-            raise self._unwritable(error) from error
 
     def metadata(self, name: str, content: Mapping[str, str]) -> None:
-        self._writer.add_metadata(name, dict(content))
+        with self._writing():
+            self._writer.add_metadata(name, dict(content))
 
     def attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
-        self._writer.add_attachment(time_ns, time_ns, name, media_type, data)
+        with self._writing():
+            self._writer.add_attachment(time_ns, time_ns, name, media_type, data)
 
     def finish(self) -> None:
         """Close the file, make sure that it is on the disk, and give it its name."""
-        try:
+        with self._writing():
             self._writer.finish()
             self._stream.flush()
             os.fsync(self._stream.fileno())
@@ -81,8 +82,6 @@ class McapWriter:
                 os.fsync(folder)
             finally:
                 os.close(folder)
-        except OSError as error:
-            raise self._unwritable(error) from error
 
     def discard(self) -> None:
         """Throw the unfinished file away."""
@@ -93,10 +92,15 @@ class McapWriter:
                 raise
         self._part.unlink(missing_ok=True)
 
-    def _unwritable(self, error: OSError) -> OutputError:
-        return OutputError(
-            f"cannot write {self._part}: {error.strerror}; episodes finished before are whole, make room and record on"
-        )
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OutputError(
+                f"cannot write {self._part}: {error.strerror}; "
+                "episodes finished before are whole; make room, then record on into another --out"
+            ) from error
 
 
 @dataclass(frozen=True)

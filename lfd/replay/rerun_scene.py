@@ -22,22 +22,17 @@ PATH_COLORS = {"ee": (60, 130, 246)}
 OBJECT_COLOR = (234, 88, 12)
 
 
-def replay(clip: Clip, *, save: Path | None) -> None:
+def replay(clip: Clip, *, save: Path | None, overwrite: bool = False) -> None:
     """Write a clip to the file `save`, or open the viewer.
 
-    Raises `OutputError` when the file cannot be written.
+    Raises `OutputError` when the file exists or cannot be written.
     """
     recording = rr.RecordingStream("lfd", recording_id=clip.title)
-    if save is None:
+    part = None if save is None else _new_file(save, overwrite)
+    if part is None:
         recording.spawn()
     else:
-        try:
-            save.parent.mkdir(parents=True, exist_ok=True)
-            with save.open("wb"):
-                pass
-        except OSError as error:
-            raise OutputError(f"cannot write {save}: {error.strerror}; choose another --save") from error
-        recording.save(save)
+        recording.save(part)
     recording.send_recording_name(clip.title)
     recording.send_blueprint(_blueprint(clip))
     if clip.model is not None and clip.qpos is not None:
@@ -46,8 +41,22 @@ def replay(clip: Clip, *, save: Path | None) -> None:
     _log_paths(recording, clip)
     _log_curves(recording, clip)
     recording.flush()
-    if save is not None:
+    if save is not None and part is not None:
         recording.disconnect()
+        part.replace(save)
+
+
+def _new_file(path: Path, overwrite: bool) -> Path:
+    """An empty file beside `path`, to take its place when it is whole."""
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path} exists already; choose another --save, or add --overwrite to replace it")
+    part = path.with_name(path.name + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(b"")
+    except OSError as error:
+        raise OutputError(f"cannot write {path}: {error.strerror}; choose another --save") from error
+    return part
 
 
 def _blueprint(clip: Clip) -> rrb.Blueprint:

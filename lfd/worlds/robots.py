@@ -31,10 +31,9 @@ class RobotConfig:
 
 def config_folder() -> Path:
     """The folder `robot_configs/` of the current directory, else the one that came with lfd."""
-    here = Path(FOLDER)
     package = Path(__file__).parents[1]
-    installed = package / FOLDER  # in a wheel
-    return next(p for p in (here, installed, package.parent / FOLDER) if p.is_dir() or p.parent == package.parent)
+    places = [Path(FOLDER), package / FOLDER, package.parent / FOLDER]  # here, in a wheel, in a checkout
+    return next((place for place in places if place.is_dir()), places[0])
 
 
 def load_robot(name: str) -> RobotConfig:

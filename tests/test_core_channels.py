@@ -1,0 +1,28 @@
+import pytest
+
+from lfd.core.channels import CHANNELS, channel, object_names
+from lfd.core.errors import UnknownName
+
+
+def test_objects_are_filled_in() -> None:
+    row = channel("cube_pos")
+    assert (row.name, row.topic, row.path) == ("cube_pos", "/objects/cube/pose", "plots/objects/cube/position")
+    assert channel("round_nut_quat").topic == "/objects/round_nut/pose"
+
+
+def test_names_of_channels_that_end_like_objects_are_not_objects() -> None:
+    assert channel("joint_pos") is CHANNELS["joint_pos"]
+    assert object_names(["joint_pos", "ee_pos", "gripper_pos", "cube_pos", "cube_quat"]) == ["cube"]
+
+
+def test_unknown_channel_lists_the_known() -> None:
+    with pytest.raises(UnknownName, match=r"unknown channel 'joint_poz'; known: .*joint_pos.*Did you mean 'joint_pos'"):
+        channel("joint_poz")
+
+
+def test_lerobot_keys_follow_its_rule_of_names() -> None:
+    """LeRobot makes every key that starts with `action` an output and with `observation` an input."""
+    for row in CHANNELS.values():
+        feature = row.feature or ""
+        assert feature.startswith("action") == (feature == "action")
+        assert feature.startswith("observation") == (feature in ("observation.state", "observation.environment_state"))

@@ -1,0 +1,73 @@
+import numpy as np
+import pytest
+
+from lfd.core.protocols import Decision
+from lfd.experts.lift import LiftExpert, turn_downwards
+from lfd.experts.noise import NoisyPolicy
+from lfd.experts.registry import make_expert
+from lfd.run.wilson import wilson_interval
+from lfd.worlds.rollout import episode_rng, rollout
+
+
+@pytest.mark.slow
+def test_lift_succeeds_from_at_least_98_percent_of_200_starts(lift_world) -> None:
+    expert = make_expert(lift_world.spec)
+    outcomes = [
+        rollout(lift_world, expert, [], episode_rng("eval", 41, i), horizon=200, hold_steps=10) for i in range(200)
+    ]
+    successes = sum(outcome.success for outcome in outcomes)
+    assert successes >= 196, wilson_interval(successes, 200)
+
+
+def test_the_expert_recovers_from_states_that_it_would_not_have_reached(lift_world, rng) -> None:
+    """It acts from the present state alone: half a second of random actions in between do no harm."""
+    expert = make_expert(lift_world.spec)
+
+    class Disturbed:
+        name = "disturbed"
+
+        def reset(self, rng):
+            self.step = 0
+
+        def act(self, observation):
+            self.step += 1
+            if 12 <= self.step < 22:
+                return Decision(rng.uniform(-1, 1, 7))
+            return expert.act(observation)
+
+    outcomes = [
+        rollout(lift_world, Disturbed(), [], episode_rng("eval", 42, i), horizon=300, hold_steps=10) for i in range(10)
+    ]
+    assert sum(outcome.success for outcome in outcomes) >= 9
+
+
+def test_the_same_observation_gives_the_same_action(lift_world) -> None:
+    first, second = LiftExpert(lift_world.spec), LiftExpert(lift_world.spec)
+    seen = lift_world.reset(np.random.default_rng(1))
+    for _ in range(5):
+        lift_world.step(first.act(seen).action)
+    np.testing.assert_array_equal(first.act(seen).action, second.act(seen).action)
+
+
+def test_turning_downwards_ends_pointing_down() -> None:
+    from scipy.spatial.transform import Rotation
+
+    for seed in range(20):
+        start = Rotation.from_euler("xyz", [np.pi, 0, 0]) * Rotation.random(rng=np.random.default_rng(seed)) ** 0.4
+        turned = Rotation.from_rotvec(turn_downwards(start.as_quat(scalar_first=True))) * start
+        np.testing.assert_allclose(turned.as_matrix()[:, 2], [0, 0, -1], atol=1e-6)
+
+
+def test_noise_is_applied_and_the_label_stays_clean(lift_world) -> None:
+    expert, noisy = make_expert(lift_world.spec), NoisyPolicy(make_expert(lift_world.spec), scale=0.3)
+    seen = lift_world.reset(np.random.default_rng(1))
+    noisy.reset(np.random.default_rng(2))
+    meant = expert.act(seen).action
+    decisions = [noisy.act(seen) for _ in range(2000)]
+    for decision in decisions:
+        np.testing.assert_array_equal(decision.expert_action, meant)
+        assert decision.action[-1] == meant[-1]
+    away = np.array([decision.action - meant for decision in decisions])[:, 1]  # unclipped: the expert hardly moves in y
+    assert abs(meant[1]) < 0.2
+    assert away.std() == pytest.approx(0.3, rel=0.15)
+    assert np.corrcoef(away[:-1], away[1:])[0, 1] == pytest.approx(0.8, abs=0.08)

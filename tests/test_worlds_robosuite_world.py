@@ -1,0 +1,101 @@
+import numpy as np
+import pytest
+
+from lfd import make_world
+from lfd.core.errors import InputError, UnknownName
+from lfd.worlds.rollout import episode_rng
+
+
+def test_the_observation_has_the_labels_of_the_spec(lift_world) -> None:
+    seen = lift_world.reset(np.random.default_rng(0))
+    sizes = {name: len(names) for name, names in lift_world.spec.labels.items() if name != "action"}
+    assert {name: len(values) for name, values in seen.items()} == sizes
+    assert len(lift_world.spec.labels["action"]) == len(lift_world.spec.action_low) == 7
+
+
+def test_observations_equal_robosuites_own_computed_afresh(lift_world, rng) -> None:
+    lift_world.reset(rng)
+    seen = lift_world.step(rng.uniform(-1, 1, 7)).observation
+    env = lift_world._env
+    for observable in env._observables.values():
+        observable.set_enabled(True)
+    theirs = env._get_observations(force_update=True)
+    for observable in env._observables.values():
+        observable.set_enabled(False)
+    pairs = {
+        "joint_pos": "robot0_joint_pos",
+        "joint_vel": "robot0_joint_vel",
+        "gripper_pos": "robot0_gripper_qpos",
+        "gripper_vel": "robot0_gripper_qvel",
+        "ee_pos": "robot0_eef_pos",
+        "cube_pos": "cube_pos",
+    }
+    for ours, name in pairs.items():
+        np.testing.assert_allclose(seen[ours], theirs[name], atol=1e-12, err_msg=name)
+    for ours, name in (("ee_quat", "robot0_eef_quat_site"), ("cube_quat", "cube_quat")):
+        assert abs(np.dot(np.roll(seen[ours], -1), theirs[name])) == pytest.approx(1, abs=1e-6)  # xyzw, either sign
+
+
+def test_the_same_seed_gives_the_same_start_bit_for_bit(lift_world) -> None:
+    starts = []
+    for _ in range(2):
+        np.random.seed(np.random.randint(1000))  # whatever ran before
+        lift_world.reset(np.random.default_rng(5))
+        starts.append(lift_world.get_state())
+    assert starts[0].model_xml == starts[1].model_xml
+    np.testing.assert_array_equal(starts[0].sim, starts[1].sim)
+    lift_world.reset(np.random.default_rng(6))
+    assert (lift_world.sim_state() != starts[0].sim).any()
+
+
+def test_a_reset_leaves_the_global_random_state_alone(lift_world) -> None:
+    np.random.seed(11)
+    expected = np.random.random()
+    np.random.seed(11)
+    lift_world.reset(np.random.default_rng(0))
+    assert np.random.random() == expected
+
+
+def test_a_restored_state_has_the_same_future_bit_for_bit(lift_world, rng) -> None:
+    actions = rng.uniform(-1, 1, (30, 7))
+    lift_world.reset(rng)
+    kept, states = {}, []
+    for t, action in enumerate(actions):
+        if t in (0, 12):
+            kept[t] = lift_world.get_state()
+        lift_world.step(action)
+        states.append(lift_world.sim_state())
+    fresh = make_world("Lift", "panda", 20)
+    for world in (lift_world, fresh):
+        for t, state in kept.items():
+            world.reset(np.random.default_rng(99))  # another cube, another controller memory
+            world.set_state(state)
+            for action, expected in zip(actions[t:], states[t:], strict=True):
+                world.step(action)
+                np.testing.assert_array_equal(world.sim_state(), expected)
+
+
+def test_stages_start_from_different_states_for_the_same_seed(lift_world) -> None:
+    lift_world.reset(episode_rng("record", 0, 0))
+    demonstrated = lift_world.sim_state()
+    lift_world.reset(episode_rng("eval", 0, 0))
+    assert (lift_world.sim_state() != demonstrated).any()
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [(np.zeros(6), r"shape \(6,\), panda takes \(7,\)"), (np.full(7, np.nan), "not finite")],
+)
+def test_an_action_that_does_not_fit_never_reaches_physics(lift_world, action, message) -> None:
+    lift_world.reset(np.random.default_rng(0))
+    before = lift_world.sim_state()
+    with pytest.raises(InputError, match=message):
+        lift_world.step(action)
+    np.testing.assert_array_equal(lift_world.sim_state(), before)
+
+
+def test_unknown_names_list_the_known() -> None:
+    with pytest.raises(UnknownName, match="unknown task 'Lif'; known: Lift. Did you mean 'Lift'"):
+        make_world("Lif", "panda", 20)
+    with pytest.raises(UnknownName, match="unknown robot 'pandas'; known: panda."):
+        make_world("Lift", "pandas", 20)
