@@ -67,7 +67,9 @@ def test_noise_is_applied_and_the_label_stays_clean(lift_world) -> None:
     for decision in decisions:
         np.testing.assert_array_equal(decision.expert_action, meant)
         assert decision.action[-1] == meant[-1]
-    away = np.array([decision.action - meant for decision in decisions])[:, 1]  # unclipped: the expert hardly moves in y
+    away = np.array([decision.action - meant for decision in decisions])[
+        :, 1
+    ]  # unclipped: the expert hardly moves in y
     assert abs(meant[1]) < 0.2
     assert away.std() == pytest.approx(0.3, rel=0.15)
     assert np.corrcoef(away[:-1], away[1:])[0, 1] == pytest.approx(0.8, abs=0.08)

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from lfd.worlds.rollout import Outcome, rollout
 class Line:
     """A point on a line; the action moves it, beyond 1 the task is solved."""
 
-    spec = None
+    spec: Any = None
 
     def sim_state(self):
         return np.array([self.x])
@@ -63,27 +65,33 @@ class Log:
 
 def test_an_episode_ends_when_the_task_stays_solved() -> None:
     log = Log()
-    outcome = rollout(Line(), Push(0.5), [log], np.random.default_rng(0), horizon=10, hold_steps=2)  # type: ignore[arg-type]
+    outcome = rollout(Line(), Push(0.5), [log], np.random.default_rng(0), horizon=10, hold_steps=2)
     assert outcome == Outcome(steps=3 + (outcome.steps == 4), success=True, reward=float(outcome.steps))
     assert log.events[0] == "begin"
     assert log.events[-2:] == [(outcome.steps - 1, True), "end True"]
 
 
 def test_an_episode_ends_at_the_horizon() -> None:
-    outcome = rollout(Line(), Push(0.0), [], np.random.default_rng(0), horizon=10, hold_steps=1)  # type: ignore[arg-type]
+    outcome = rollout(Line(), Push(0.0), [], np.random.default_rng(0), horizon=10, hold_steps=1)
     assert outcome == Outcome(steps=10, success=False, reward=10.0)
 
 
 def test_observers_hear_of_an_episode_that_is_broken_off() -> None:
     log = Log()
     with pytest.raises(KeyboardInterrupt):
-        rollout(Line(), Push(-0.1), [log], np.random.default_rng(0), horizon=10, hold_steps=1)  # type: ignore[arg-type]
+        rollout(Line(), Push(-0.1), [log], np.random.default_rng(0), horizon=10, hold_steps=1)
     assert log.events == ["begin", (0, False), (1, False), (2, False), "abort"]
 
 
 def test_an_episode_can_begin_anywhere() -> None:
     start = WorldState(model_xml="", sim=np.array([0.9]), memory={})
     outcome = rollout(
-        Line(), Push(0.2), [], np.random.default_rng(0), horizon=10, hold_steps=1, start=start  # type: ignore[arg-type]
+        Line(),
+        Push(0.2),
+        [],
+        np.random.default_rng(0),
+        horizon=10,
+        hold_steps=1,
+        start=start,
     )
     assert outcome.steps == 1

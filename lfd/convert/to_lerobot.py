@@ -80,13 +80,15 @@ def convert(
             video_backend="pyav",
         )
         frames = 0
-        with progress("convert", len(paths)) as bar:
-            for path in paths:
-                episode = read_episode(path)
-                _check_fits(episode, path, first, paths[0])
-                frames += _add(dataset, episode, recipe)
-                bar.advance(note=f"{frames} frames")
-        dataset.finalize()
+        try:
+            with progress("convert", len(paths)) as bar:
+                for path in paths:
+                    episode = read_episode(path)
+                    _check_fits(episode, path, first, paths[0])
+                    frames += _add(dataset, episode, recipe)
+                    bar.advance(note=f"{frames} frames")
+        finally:
+            dataset.finalize()  # LeRobot would otherwise write when the object is collected, folder or not
         compared = _verify(part, out.name, paths, recipe, progress, dataset_class)
         (part / MODEL).write_text(first.model_xml, encoding="utf-8")
         hashes = {str(path): sha256(path) for path in paths}

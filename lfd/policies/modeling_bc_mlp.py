@@ -40,20 +40,20 @@ class BcMlpPolicy(PreTrainedPolicy):
     def reset(self) -> None:
         """Nothing to forget: the policy has no memory."""
 
-    def predict(self, batch: dict[str, Tensor]) -> Float[Tensor, "B Da"]:
+    def predict(self, batch: dict[str, Any]) -> Float[Tensor, "B Da"]:
         """Actions for normalised observations."""
         return self.net(torch.cat([batch[key] for key in self.inputs], dim=-1))
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    def forward(self, batch: dict[str, Any]) -> tuple[Float[Tensor, ""], dict[str, float]]:
         """The loss L averaged over the batch."""
         return nn.functional.mse_loss(self.predict(batch), batch["action"]), {}
 
     @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Float[Tensor, "B Da"]:
+    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Float[Tensor, "B Da"]:
         """The action for the next control step."""
         return self.predict(batch)
 
     @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Float[Tensor, "B 1 Da"]:
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Float[Tensor, "B 1 Da"]:
         """The next action as a chunk of one."""
         return self.predict(batch).unsqueeze(1)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from lfd.core.artifact import versions
+from lfd.core.episode import Episode
 from lfd.core.errors import RecordingError
 from lfd.core.protocols import Observation, Transition, World, WorldState
 from lfd.experts.playback import PlaybackPolicy
@@ -48,15 +49,21 @@ class _States:
 
 
 def verify_replay(source: Path, index: int = 0) -> Verification:
-    """Replay the recording `source`, or number `index` of a folder, in the world that its metadata name.
+    """Replay the recording `source`, or number `index` of a folder, and compare.
 
-    Raises `RecordingError` for a file that cannot be read or that has no states to start from.
+    Raises `RecordingError` for a file that cannot be read.
     """
-    recording = recording_in(source, index)
-    episode = read_episode(recording)
+    return verify_episode(read_episode(recording_in(source, index)))
+
+
+def verify_episode(episode: Episode) -> Verification:
+    """Replay an episode in the world that its metadata name.
+
+    Raises `RecordingError` when it has no states to start from.
+    """
     about = episode.metadata
     if episode.sim_states is None or episode.start_memory is None:
-        raise RecordingError(f"{recording} has no simulation states; only recordings of lfd can be replayed exactly")
+        raise RecordingError("the episode has no simulation states; only recordings of lfd can be replayed exactly")
     world = make_world(about.task, about.robot, about.control_hz)
     start = WorldState(model_xml=episode.model_xml, sim=episode.sim_states[0], memory=episode.start_memory)
     states = _States()
