@@ -1,5 +1,5 @@
 # Every target sets up .venv first. A Python >= 3.12 is enough; `uv` is used when it is there and installed into .venv when not.
-.PHONY: demo test lint type format lock clean
+.PHONY: demo test lint type format results pictures system lock clean
 
 BIN := .venv/bin
 READY := .venv/ready
@@ -18,6 +18,16 @@ type: $(READY)
 
 format: $(READY)
 	$(BIN)/ruff format && $(BIN)/ruff check --fix
+
+results: $(READY)
+	$(BIN)/lfd demo --out outputs/demo --overwrite --results docs/results.md
+
+pictures: $(READY)
+	$(BIN)/python docs/make_pictures.py
+
+# What the pictures need beside Python, on Debian and Ubuntu: a software Vulkan driver for Rerun's viewer.
+system:
+	apt-get update -qq && apt-get install -y -qq mesa-vulkan-drivers
 
 lock: $(READY)
 	$(UV) pip compile --quiet --no-emit-index-url --no-header --python-version 3.12 --extra dev pyproject.toml --output-file requirements.lock

@@ -177,10 +177,15 @@ def _doctor(given: argparse.Namespace) -> Result:
 
 
 def _demo(given: argparse.Namespace) -> Result:
-    from lfd.loops.demo import demo
+    from lfd.loops.demo import demo, rows_of
+    from lfd.loops.results import write_section
     from lfd.terminal import progress_bar
 
-    return demo(given.dataset_recipe, given.policy_recipe, given.out, overwrite=given.overwrite, progress=progress_bar)
+    recipes = given.dataset_recipe, given.policy_recipe
+    measured = demo(*recipes, given.out, overwrite=given.overwrite, progress=progress_bar)
+    if given.results is not None:
+        write_section(given.results, "The thread on Lift with a Panda", "lfd demo", rows_of(measured))
+    return measured if given.json else dict(rows_of(measured))
 
 
 def _put(tables: dict[str, dict[str, Any]], table: str, **values: Any) -> None:
@@ -309,6 +314,9 @@ def _parser() -> argparse.ArgumentParser:
         "--policy-recipe", type=Path, default=Path("policies/bc_mlp.toml"), metavar="RECIPE",
         help="default: policies/bc_mlp.toml",
     )  # fmt: skip
+    made.add_argument(
+        "--results", type=Path, metavar="PAGE.md", help="also write the table into a section of this page"
+    )
     output(made, "everything that the stages make")
     return parser
 

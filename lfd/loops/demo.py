@@ -77,3 +77,21 @@ def demo(
     }
     write_json(out / "report.json", measured)
     return measured
+
+
+def rows_of(measured: dict[str, Any]) -> dict[str, str]:
+    """A demo's report as lines of a table."""
+    low, high = measured["interval"]
+    speed = measured["control_steps_per_second"]
+    return {
+        "success": f"{measured['success_rate']:.0%} of {measured['episodes']} unseen starts, "
+        f"95% interval {low:.1%} to {high:.1%}",
+        "mean episode": f"{measured['mean_steps']:.1f} control steps",
+        "demonstrations": f"{measured['demonstrations']}, {measured['failed_attempts']} attempts failed",
+        "dataset": f"{measured['frames']} frames, {measured['numbers_compared']} numbers read back equal",
+        "training": f"{measured['training']['steps']} steps, loss {measured['training']['loss']:.1e}, "
+        f"{measured['training']['parameters']} parameters",
+        "exact replay": f"largest deviation {measured['replay_deviation']:g}",
+        "speed": f"{speed['record']} control steps/s recording, {speed['eval']} evaluating",
+        "time": ", ".join(f"{stage} {seconds:.0f} s" for stage, seconds in measured["seconds"].items()),
+    }
