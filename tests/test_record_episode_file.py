@@ -11,6 +11,7 @@ from lfd.core.channels import channel
 from lfd.core.errors import EpisodeError, OutputError, RecordingError
 from lfd.core.protocols import Decision
 from lfd.experts.playback import PlaybackPolicy
+from lfd.record import cdr, mcap_file
 from lfd.record.episode_file import McapRecorder, Origin, read_episode, recordings_in
 from lfd.worlds.rollout import rollout
 
@@ -175,27 +176,39 @@ def test_an_mcap_file_of_another_schema_is_refused(tmp_path) -> None:
         read_episode(path)
 
 
-def test_nan_in_a_recording_is_refused_with_its_place(lift_world, tmp_path) -> None:
-    from lfd.record import cdr, mcap_file
-
-    path = tmp_path / "episode.mcap"
-    record_steps(lift_world, path, np.zeros((3, 7)))
+def rewrite(path: Path, topic: str, row: int, data: bytes | None) -> None:
+    """The recording with one message replaced, or left out."""
     content = mcap_file.read_mcap(path)
     writer = mcap_file.McapWriter(path)
     for name in ("joint_pos", "ee_pos", "cube_pos", "action", "reward", "sim_state"):
-        topic = channel(name).topic
-        writer.channel(topic, channel(name).schema, {})
-        for row, (stamp, data) in enumerate(content.messages[topic]):
-            broken = cdr.pack_array(("a",) * 7, np.full(7, np.nan)) if (topic, row) == ("/action", 1) else data
-            writer.message(topic, stamp, broken)
+        written = channel(name).topic
+        writer.channel(written, channel(name).schema, {})
+        for number, (stamp, original) in enumerate(content.messages[written]):
+            changed = data if (written, number) == (topic, row) else original
+            if changed is not None:
+                writer.message(written, stamp, changed)
     for name, values in content.metadata.items():
         writer.metadata(name, values)
-    for name, data in content.attachments.items():
-        writer.attachment(name, "", data, 0)
+    for name, attached in content.attachments.items():
+        writer.attachment(name, "", attached, 0)
     writer.finish()
+
+
+def test_numbers_that_are_no_episode_are_refused_with_their_place(lift_world, tmp_path) -> None:
+    path = tmp_path / "episode.mcap"
+    record_steps(lift_world, path, np.zeros((3, 7)))
+    rewrite(path, "/action", 1, cdr.pack_array(("a",) * 7, np.full(7, np.nan)))
     with pytest.raises(
         EpisodeError, match=r"episode.mcap: channel 'action' is not finite at step 1; leave the file out"
     ):
+        read_episode(path)
+    record_steps(lift_world, path, np.zeros((3, 7)))
+    rewrite(path, "/ee_pose", 2, None)
+    with pytest.raises(EpisodeError, match=r"episode.mcap: channel 'ee_pos' has 3 rows, 3 actions need 4"):
+        read_episode(path)
+    record_steps(lift_world, path, np.zeros((3, 7)))
+    rewrite(path, "/action", 0, cdr.pack_array(("a",) * 5, np.zeros(5)))
+    with pytest.raises(RecordingError, match=r"episode.mcap cannot be decoded as an episode"):
         read_episode(path)
 
 

@@ -112,6 +112,12 @@ def test_a_recorded_model_is_loaded_from_the_installed_meshes(thread) -> None:
     assert load_model(episode.model_xml).nmesh > 20
 
 
+def test_without_a_screen_the_way_out_is_named(thread, lfd_fails, monkeypatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert "write a file with --save" in lfd_fails("replay", thread.recordings)
+
+
 def test_what_cannot_be_shown(thread, lfd_fails, tmp_path) -> None:
     assert "episodes 0 to 1, not 7" in lfd_fails(
         "replay", thread.recordings, "--episode", "7", "--save", tmp_path / "x"

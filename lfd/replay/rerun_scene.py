@@ -3,6 +3,8 @@
 Meshes are logged once, without time; what moves are the transforms of their bodies, sent as columns.
 """
 
+import os
+import sys
 from pathlib import Path
 
 import mujoco
@@ -25,9 +27,11 @@ OBJECT_COLOR = (234, 88, 12)
 def replay(clip: Clip, *, save: Path | None, overwrite: bool = False) -> None:
     """Write a clip to the file `save`, or open the viewer.
 
-    Raises `OutputError` when the file exists or cannot be written.
+    Raises `OutputError` when the file exists or cannot be written, or when there is no screen.
     """
     recording = rr.RecordingStream("lfd", recording_id=clip.title)
+    if save is None and sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+        raise OutputError("no screen to open the viewer on; write a file with --save X.rrd and open it elsewhere")
     part = None if save is None else _new_file(save, overwrite)
     if part is None:
         recording.spawn()
