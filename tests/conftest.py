@@ -11,7 +11,18 @@ import pytest
 from jaxtyping import install_import_hook
 
 os.environ["HF_HUB_OFFLINE"] = "1"
-CHECKED = ("core.rotations", "core.protocols", "worlds", "experts", "convert", "data", "policies", "run", "replay")
+CHECKED = (
+    "core.rotations",
+    "core.protocols",
+    "worlds.rollout",
+    "worlds.robosuite_world",
+    "experts",
+    "convert",
+    "data",
+    "policies",
+    "run",
+    "replay",
+)
 install_import_hook([f"lfd.{name}" for name in CHECKED], "beartype.beartype")
 
 ROOT = Path(__file__).parents[1]

@@ -142,7 +142,14 @@ def test_info_of_a_recording_and_of_a_recipe(thread, capfd, lfd_fails, tmp_path)
 def test_ctrl_c_keeps_finished_episodes(tmp_path) -> None:
     out = tmp_path / "recordings"
     command = [sys.executable, "-m", "lfd.cli", "record", str(LIFT), "--out", str(out)]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command,
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in background jobs
+    )
     deadline = time.monotonic() + 120
     while len(list(out.glob("*.mcap"))) < 2:
         assert time.monotonic() < deadline

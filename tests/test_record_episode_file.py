@@ -59,7 +59,7 @@ def test_an_episode_is_read_back_to_the_bit(lift_world, tmp_path, rng) -> None:
     np.testing.assert_array_equal(episode.sim_states[-1], lift_world.sim_state())
     assert episode.expert_actions is None
     assert episode.labels == lift_world.spec.labels
-    assert (episode.metadata.seed, episode.metadata.index, episode.metadata.stepper) == (1, 2, "robosuite")
+    assert (episode.metadata.seed, episode.metadata.index, episode.metadata.stepper) == (1, 2, lift_world.step_backend)
     assert '"robosuite/models/assets' in episode.model_xml
     assert "/site-packages/" not in episode.model_xml
     assert list(tmp_path.iterdir()) == [path]

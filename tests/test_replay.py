@@ -22,7 +22,7 @@ def test_a_recording_is_executed_again_without_deviation(thread) -> None:
         assert (found.deviation, found.first_step, found.differences) == (0.0, None, ())
     evaluated = call_json(["replay", str(thread.run), "--episode", "1", "--verify"])
     assert evaluated["deviation"] == 0
-    assert evaluated["stepper"] == "robosuite"
+    assert evaluated["stepper"] == "compiled"
 
 
 def test_another_action_is_noticed(thread) -> None:

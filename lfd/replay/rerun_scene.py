@@ -94,7 +94,7 @@ def _log_shapes(recording: rr.RecordingStream, model: mujoco.MjModel) -> None:
         shape = _shape(model, index, color)
         if shape is None:
             continue
-        path = f"world/{_body_name(model, geom.bodyid[0])}/{geom.name or index}"
+        path = f"world/{_body_name(model, int(geom.bodyid[0]))}/{geom.name or index}"
         pose = rr.Transform3D(translation=geom.pos, quaternion=rr.Quaternion(xyzw=xyzw_from_wxyz(geom.quat)))
         recording.log(path, pose, shape, static=True)
 

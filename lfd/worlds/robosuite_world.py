@@ -2,7 +2,8 @@
 
 robosuite builds the model, draws start states, runs its controllers and judges success; observations are
 read from MjData after the step, so that they belong to the state that the next action acts on (robosuite's
-own observables lag by one physics step).
+own observables lag by one physics step). The control step itself is compiled where it can be
+(`lfd.worlds.steppers`).
 """
 
 import logging
@@ -19,11 +20,13 @@ from lfd.core.channels import WXYZ, XYZ
 from lfd.core.errors import InputError, SimulationError, UnknownName
 from lfd.core.protocols import Observation, StepResult, WorldSpec, WorldState
 from lfd.worlds.robots import CONTROLLERS, RobotConfig, load_robot
+from lfd.worlds.steppers import make_stepper, uncovered
 from lfd.worlds.tasks import TASKS
 
-STEPPER = "robosuite"
+SELF_CHECK_TOLERANCE = 1e-9
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+logger = logging.getLogger(__name__)
 _GLOBAL_RANDOM = threading.Lock()  # robosuite 1.5.1 draws from numpy's global generator
 
 
@@ -67,13 +70,16 @@ class RobosuiteWorld:
     Raises `UnknownName` for a task that lfd does not know.
     """
 
-    def __init__(self, *, task: str, robot_name: str, robot: RobotConfig, control_hz: int):
+    def __init__(self, *, task: str, robot_name: str, robot: RobotConfig, control_hz: int, stepper: str = "auto"):
         if task not in TASKS:
             raise UnknownName("task", task, TASKS)
         self._env = _make_environment(task, robot, control_hz)
         for observable in self._env._observables.values():
             observable.set_enabled(False)  # read by nobody here
+        self._wanted = stepper
         self._attach()
+        if stepper == "auto":
+            self._choose_stepper()
         self.spec = WorldSpec(
             task=task,
             instruction=TASKS[task],
@@ -83,8 +89,13 @@ class RobosuiteWorld:
             labels=self._labels(robot),
             action_low=self._env.action_spec[0],
             action_high=self._env.action_spec[1],
-            stepper=STEPPER,
+            stepper=self._stepper.name,
         )
+
+    @property
+    def step_backend(self) -> str:
+        """What computes the control steps: compiled or robosuite."""
+        return self._stepper.name
 
     def reset(self, rng: np.random.Generator) -> Observation:
         """Draw a start state as robosuite does: object poses and sizes, joint noise."""
@@ -110,12 +121,11 @@ class RobosuiteWorld:
             raise InputError(f"the action has shape {action.shape}, {self.spec.robot} takes {expected}")
         if not np.isfinite(action).all():
             raise InputError(f"the action is not finite: {action}")
-        _, reward, _, _ = self._env.step(action)
+        self._stepper.step(action)
         for kind in UNSTABLE:
             if self._data.warning[kind].number:
                 raise SimulationError(f"MuJoCo reports {mujoco.mjtWarning(kind).name} at t = {self._data.time:.3f} s")
-        mujoco.mj_step1(self._model, self._data)  # poses and velocities of the state reached
-        return StepResult(self._observe(), float(reward), bool(self._env._check_success()))
+        return StepResult(self._observe(), float(self._env.reward(action)), bool(self._env._check_success()))
 
     def sim_state(self) -> Float[np.ndarray, "_"]:
         """MuJoCo's mjSTATE_INTEGRATION now."""
@@ -160,6 +170,26 @@ class RobosuiteWorld:
         self._qvel = {kind: np.array([j.dofadr[0] for j in joints]) for kind, joints in self._joints.items()}
         self._grip_site = self._model.site(grip.important_sites["grip_site"]).id
         self._objects = {o.name: self._model.body(o.root_body).id for o in self._env.model.mujoco_objects}
+        self._stepper = make_stepper(self._wanted, self._env)
+
+    def _choose_stepper(self) -> None:
+        """Keep the compiled step if one step of it gives robosuite's numbers; say so and take robosuite's if not."""
+        start = self.get_state()
+        action = np.linspace(-0.5, 0.5, len(self._env.action_spec[0]))
+        states = {}
+        for name in dict.fromkeys((self._stepper.name, "robosuite")):
+            self.set_state(start)
+            make_stepper(name, self._env).step(action)
+            states[name] = np.concatenate([self._data.qpos, self._data.qvel, self._data.ctrl])
+        self.set_state(start)
+        away = float(np.abs(states[self._stepper.name] - states["robosuite"]).max())
+        if away > SELF_CHECK_TOLERANCE or self._stepper.name == "robosuite":
+            reason = uncovered(self._env) or f"this machine (one step differs by {away:.1e})"
+            logger.warning(
+                "robosuite's own step is used, several times slower: the compiled one does not cover %s", reason
+            )
+            self._wanted = "robosuite"
+            self._stepper = make_stepper("robosuite", self._env)
 
     def _labels(self, robot: RobotConfig) -> Mapping[str, tuple[str, ...]]:
         labels: dict[str, tuple[str, ...]] = {}
@@ -213,9 +243,11 @@ class RobosuiteWorld:
             setattr(self._parts()[part], name, bool(value) if name == "new_update" else np.array(value))
 
 
-def make_world(task: str, robot: str, control_hz: int) -> RobosuiteWorld:
+def make_world(task: str, robot: str, control_hz: int, stepper: str = "auto") -> RobosuiteWorld:
     """The world of a task and a robot config, by their names.
 
-    Raises `UnknownName` for a task or robot that lfd does not know.
+    `stepper` is `compiled`, `robosuite`, or `auto`: the compiled one where it covers the robot and gives
+    robosuite's numbers. Raises `UnknownName` for a task, robot or stepper that lfd does not know.
     """
-    return RobosuiteWorld(task=task, robot_name=robot, robot=load_robot(robot), control_hz=control_hz)
+    config = load_robot(robot)
+    return RobosuiteWorld(task=task, robot_name=robot, robot=config, control_hz=control_hz, stepper=stepper)
