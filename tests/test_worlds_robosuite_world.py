@@ -48,6 +48,46 @@ def test_the_same_seed_gives_the_same_start_bit_for_bit(lift_world) -> None:
     assert (lift_world.sim_state() != starts[0].sim).any()
 
 
+def test_a_reset_without_rebuilding_gives_robosuites_own_start(lift_world) -> None:
+    """Same draws: model, state and controllers equal those of robosuite's hard reset, bit for bit."""
+    for seed in range(4):
+        lift_world.reset(np.random.default_rng(seed))
+        ours, fields = lift_world.get_state(), model_fields(lift_world)
+        lift_world._is_guest = True  # robosuite rebuilds the model
+        lift_world.reset(np.random.default_rng(seed))
+        theirs = lift_world.get_state()
+        np.testing.assert_array_equal(ours.sim, theirs.sim)
+        both = ours.memory.keys() & theirs.memory.keys()
+        assert all(".action_" in key for key in ours.memory.keys() ^ both)  # constants that robosuite fills in late
+        for key in both:
+            np.testing.assert_array_equal(ours.memory[key], theirs.memory[key], err_msg=key)
+        for name, values in model_fields(lift_world).items():
+            np.testing.assert_array_equal(fields[name], values, err_msg=name)
+        assert sizes(ours.model_xml) == sizes(theirs.model_xml)
+
+
+def model_fields(world) -> dict[str, np.ndarray]:
+    """Every number of the compiled model."""
+    named = {name: getattr(world._model, name) for name in dir(world._model) if not name.startswith("_")}
+    return {name: value.copy() for name, value in named.items() if isinstance(value, np.ndarray)}
+
+
+def sizes(xml: str) -> list[str]:
+    import xml.etree.ElementTree as ET
+
+    return [geom.get("size", "") for geom in ET.fromstring(xml).iter("geom")]
+
+
+def test_cube_sizes_are_drawn_from_robosuites_range(lift_world) -> None:
+    drawn = []
+    for seed in range(60):
+        lift_world.reset(np.random.default_rng(seed))
+        drawn.append(lift_world._model.geom("cube_g0").size.copy())
+    assert np.min(drawn) >= 0.020
+    assert np.max(drawn) <= 0.022
+    assert np.std(drawn) == pytest.approx(0.002 / np.sqrt(12), rel=0.2)
+
+
 def test_a_reset_leaves_the_global_random_state_alone(lift_world) -> None:
     np.random.seed(11)
     expected = np.random.random()

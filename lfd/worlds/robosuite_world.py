@@ -19,6 +19,7 @@ from jaxtyping import Float
 from lfd.core.channels import WXYZ, XYZ
 from lfd.core.errors import InputError, SimulationError, UnknownName
 from lfd.core.protocols import Observation, StepResult, WorldSpec, WorldState
+from lfd.worlds.drawn_sizes import draw_sizes
 from lfd.worlds.robots import CONTROLLERS, RobotConfig, load_robot
 from lfd.worlds.steppers import make_stepper, uncovered
 from lfd.worlds.tasks import TASKS
@@ -76,7 +77,7 @@ class RobosuiteWorld:
         self._env = _make_environment(task, robot, control_hz)
         for observable in self._env._observables.values():
             observable.set_enabled(False)  # read by nobody here
-        self._wanted = stepper
+        self._task, self._wanted = task, stepper
         self._attach()
         if stepper == "auto":
             self._choose_stepper()
@@ -98,16 +99,24 @@ class RobosuiteWorld:
         return self._stepper.name
 
     def reset(self, rng: np.random.Generator) -> Observation:
-        """Draw a start state as robosuite does: object poses and sizes, joint noise."""
+        """Draw a start state as robosuite does: object sizes and poses, joint noise.
+
+        The model is not rebuilt, unless `set_state` brought another one in.
+        """
         seed = int(rng.integers(2**32))
+        self._env.hard_reset = self._is_guest
         with _GLOBAL_RANDOM:
             outside = np.random.get_state()
             np.random.seed(seed)
             try:
+                if not self._is_guest:
+                    draw_sizes(self._task, self._env)
                 self._env.reset()
             finally:
                 np.random.set_state(outside)
-        self._attach()
+        if self._is_guest:
+            self._attach()
+        self._model_xml = None
         return self._observe()
 
     def step(self, action: Float[np.ndarray, "Da"]) -> StepResult:
@@ -161,7 +170,7 @@ class RobosuiteWorld:
         """Look up where the present model keeps what observations are read from."""
         sim = self._env.sim
         self._model, self._data = sim.model._model, sim.data._data
-        self._model_xml = model_xml
+        self._model_xml, self._is_guest = model_xml, model_xml is not None
         robot = self._env.robots[0]
         grip = robot.gripper["right"]
         names = {"joint": robot.robot_model.arm_joints, "gripper": grip.joints}
