@@ -188,6 +188,17 @@ def _demo(given: argparse.Namespace) -> Result:
     return measured if given.json else dict(rows_of(measured))
 
 
+def _bench(given: argparse.Namespace) -> Result:
+    from lfd.bench.sim import bench_sim
+    from lfd.terminal import progress_bar
+
+    episodes = 2 if given.quick else 20
+    measured = bench_sim(
+        task=given.task, robot=given.robot, control_hz=20, episodes=episodes, seed=given.seed, progress=progress_bar
+    )
+    return asdict(measured)
+
+
 def _put(tables: dict[str, dict[str, Any]], table: str, **values: Any) -> None:
     """Put the options that were given over the recipe's keys."""
     tables.setdefault(table, {}).update({key: value for key, value in values.items() if value is not None})
@@ -299,6 +310,18 @@ def _parser() -> argparse.ArgumentParser:
     made.add_argument("path", type=Path, metavar="PATH", help="file or folder")
 
     command("doctor", _doctor, "say what of this machine works", "lfd doctor")
+
+    made = command(
+        "bench",
+        _bench,
+        "measure the simulation: robosuite's step, ours, and the physics alone, side by side",
+        "lfd bench sim --quick",
+    )
+    made.add_argument("suite", choices=["sim"], help="what to measure")
+    made.add_argument("--quick", action="store_true", help="a tenth of the steps")
+    made.add_argument("--task", default="Lift", help="default: Lift")
+    made.add_argument("--robot", default="panda", help="default: panda")
+    made.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the start states (default: 0)")
 
     made = command(
         "demo",

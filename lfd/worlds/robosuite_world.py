@@ -40,7 +40,8 @@ def import_robosuite() -> Any:
     return robosuite
 
 
-def _make_environment(task: str, robot: RobotConfig, control_hz: int) -> Any:
+def make_environment(task: str, robot: RobotConfig, control_hz: int, **options: Any) -> Any:
+    """robosuite's own environment, without rendering; `options` go to `robosuite.make`."""
     robosuite = import_robosuite()
     from robosuite.controllers import load_composite_controller_config, load_part_controller_config
 
@@ -57,6 +58,7 @@ def _make_environment(task: str, robot: RobotConfig, control_hz: int) -> Any:
         use_camera_obs=False,
         control_freq=control_hz,
         ignore_done=True,
+        **options,
     )
 
 
@@ -74,7 +76,7 @@ class RobosuiteWorld:
     def __init__(self, *, task: str, robot_name: str, robot: RobotConfig, control_hz: int, stepper: str = "auto"):
         if task not in TASKS:
             raise UnknownName("task", task, TASKS)
-        self._env = _make_environment(task, robot, control_hz)
+        self._env = make_environment(task, robot, control_hz)
         for observable in self._env._observables.values():
             observable.set_enabled(False)  # read by nobody here
         self._task, self._wanted = task, stepper
