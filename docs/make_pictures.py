@@ -3,6 +3,8 @@
 Rerun's viewer runs without a screen; it needs a Vulkan driver (`make system`).
 """
 
+import os
+import signal
 import subprocess
 import sys
 import time
@@ -19,13 +21,15 @@ def main() -> None:
     """Write docs/pictures/replay.png."""
     rerun = Path(sys.executable).with_name("rerun")
     options = ["--headless", "--port", str(PORT), "--window-size", "1200x700"]
-    viewer = subprocess.Popen([rerun, ROLLOUT, *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    viewer = subprocess.Popen(
+        [rerun, ROLLOUT, *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
     try:
         time.sleep(NOTICES_S)
         ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy").save_screenshot("docs/pictures/replay.png")
         time.sleep(1.0)
     finally:
-        viewer.terminate()
+        os.killpg(viewer.pid, signal.SIGTERM)  # the command is a wrapper around the viewer
         viewer.wait()
 
 

@@ -1,7 +1,8 @@
 """`lfd bench sim`: a control step of robosuite, ours, and what the physics alone would allow.
 
-All sides step from the same states with the same actions, in turn, and CPU time is counted, so that the
-ratios hold on a machine that is busy or changes its clock. A rate is that of the median step.
+All sides take the same actions from the same starts, episode by episode in turn, and CPU time is counted, so
+that the ratios hold on a machine that is busy or changes its clock. A rate is that of the median step. The
+physics alone is mj_step from the states that our steps began in.
 """
 
 import threading
@@ -54,21 +55,23 @@ def bench_sim(
         for episode in range(episodes):
             rng = episode_rng("eval", seed, episode)
             seen = resets.take("ours", lambda rng=rng: world.reset(rng))
-            model_xml = world.get_state().model_xml
-            for env in stock.values():
-                env.reset_from_xml_string(model_xml)
-            resets.take("robosuite", stock["robosuite"].reset)
-            stock["robosuite"].reset_from_xml_string(model_xml)
-            bare = mujoco.MjData(world._model)
+            begin, actions, states, controls = world.get_state(), [], [], []
             for _ in range(2 * control_hz):
-                start, action = world.sim_state(), expert.act(seen).action
-                for name, env in stock.items():
-                    _put(env.sim.model._model, env.sim.data._data, start)
+                actions.append(expert.act(seen).action)
+                states.append(world.sim_state())
+                seen = costs.take("ours, one core", lambda action=actions[-1]: world.step(action)).observation
+                controls.append(world._data.ctrl.copy())
+            for name, env in stock.items():
+                env.reset_from_xml_string(begin.model_xml)
+                _put(env.sim.model._model, env.sim.data._data, begin.sim)
+                for action in actions:
                     costs.take(name, lambda env=env, action=action: env.step(action))
-                seen = costs.take("ours, one core", lambda action=action: world.step(action)).observation
-                mujoco.mj_setState(world._model, bare, start, INTEGRATION)
-                bare.ctrl[:] = world._data.ctrl
+            bare = mujoco.MjData(world._model)
+            for state, control in zip(states, controls, strict=True):
+                mujoco.mj_setState(world._model, bare, state, INTEGRATION)
+                bare.ctrl[:] = control
                 costs.take("physics alone", lambda bare=bare: mujoco.mj_step(world._model, bare, substeps))
+            resets.take("robosuite", stock["robosuite"].reset)
             bar.advance(note=f"{costs.rate('ours, one core'):.0f} steps/s")
     rates = {name: costs.rate(name) for name in (*stock, "ours, one core", "physics alone")}
     speedup = _threads_against_one(world, make_world(task, robot, control_hz), steps=control_hz * 10)

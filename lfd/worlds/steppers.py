@@ -46,7 +46,9 @@ class CompiledStepper:
             raise SimulationError(f"the compiled step does not cover {reason}")
         self._env, self._robot = env, env.robots[0]
         model, data = env.sim.model._model, env.sim.data._data
-        self._gripper_actuators = self._robot._ref_actuators_indexes_dict["right_gripper"]
+        self._gripper_actuators = np.array(self._robot._ref_actuators_indexes_dict["right_gripper"])
+        low, high = model.actuator_ctrlrange[self._gripper_actuators].T
+        self._gripper_middle, self._gripper_reach = 0.5 * (high + low), 0.5 * (high - low)
         part, nv = self._part, model.nv
         self._control_step = c.control_step
         self._physics = c.Physics(
@@ -106,11 +108,13 @@ class CompiledStepper:
             part.new_update = True  # what the controllers remember of the state is of an earlier one
 
     def _close(self, action: np.ndarray) -> None:
-        """The gripper's controls, as robosuite's grip controller computes them once a control step."""
-        grip = self._robot.composite_controller.part_controllers["right_gripper"]
-        grip.set_goal(self._robot.gripper["right"].format_action(action))
-        low, high = self._robot.sim.model.actuator_ctrlrange[self._gripper_actuators].T
-        self._physics.ctrl[self._gripper_actuators] = np.clip(grip.run_controller(), low, high)
+        """The gripper's controls, as robosuite's grip controller computes them once a control step.
+
+        It maps the gripper's own action, -1 to 1 for each finger, linearly onto the actuators' range.
+        """
+        fingers = self._robot.gripper["right"].format_action(action)
+        goal = np.minimum(np.maximum(fingers, -1.0), 1.0)
+        self._physics.ctrl[self._gripper_actuators] = self._gripper_middle + self._gripper_reach * goal
 
     def _memory(self) -> Any:
         """The controller's memory as the compiled function wants it.
@@ -161,6 +165,11 @@ def uncovered(env: Any) -> str:
         return f"impedance {part.impedance_mode}, input {part.input_type}, frame {part.input_ref_frame}"
     if part.interpolator_pos is not None or part.interpolator_ori is not None:
         return "interpolators"
+    grip = parts["right_gripper"]
+    plain = {grip.input_max.max(), grip.output_max.max()} == {1.0} == {-grip.input_min.min(), -grip.output_min.min()}
+    simple = type(grip).__name__ == "SimpleGripController"
+    if not (simple and grip.use_action_scaling and grip.interpolator is None and plain):
+        return f"the gripper controller {type(grip).__name__} as it is configured"
     return ""
 
 
