@@ -21,6 +21,7 @@ format: $(READY)
 
 results: $(READY)
 	$(BIN)/lfd demo --out outputs/demo --overwrite --results docs/results.md
+	$(BIN)/lfd bench sim --results docs/results.md
 
 pictures: $(READY)
 	$(BIN)/python docs/make_pictures.py

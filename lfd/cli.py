@@ -44,7 +44,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"lfd {arguments.name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"\nlfd {arguments.name}: interrupted; what was finished is kept", file=sys.stderr)
+        kept = {"record": "finished episodes are kept", "demo": "finished stages are kept"}
+        print(
+            f"\nlfd {arguments.name}: interrupted; {kept.get(arguments.name, 'nothing was written')}", file=sys.stderr
+        )
         return 1
     return 1 if failed else 0
 
@@ -190,12 +193,17 @@ def _demo(given: argparse.Namespace) -> Result:
 
 def _bench(given: argparse.Namespace) -> Result:
     from lfd.bench.sim import bench_sim
+    from lfd.loops.results import write_section
     from lfd.terminal import progress_bar
 
     episodes = 2 if given.quick else 20
     measured = bench_sim(
         task=given.task, robot=given.robot, control_hz=20, episodes=episodes, seed=given.seed, progress=progress_bar
     )
+    if given.results is not None:
+        rows = measured.ratios | {f"steps/s, {name}": rate for name, rate in measured.steps_per_second.items()}
+        command = "lfd bench sim" + (" --quick" if given.quick else "")
+        write_section(given.results, f"Simulation: {given.task} with {given.robot}", command, rows)
     return asdict(measured)
 
 
@@ -319,6 +327,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     made.add_argument("suite", choices=["sim"], help="what to measure")
     made.add_argument("--quick", action="store_true", help="a tenth of the steps")
+    made.add_argument(
+        "--results", type=Path, metavar="PAGE.md", help="also write the table into a section of this page"
+    )
     made.add_argument("--task", default="Lift", help="default: Lift")
     made.add_argument("--robot", default="panda", help="default: panda")
     made.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the start states (default: 0)")

@@ -158,7 +158,7 @@ def test_ctrl_c_keeps_finished_episodes(tmp_path) -> None:
     os.kill(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert "interrupted; what was finished is kept" in errors
+    assert "interrupted; finished episodes are kept" in errors
     assert "Traceback" not in errors
     kept = recordings_in([out])
     assert len(kept) >= 2

@@ -3,6 +3,7 @@ import pytest
 
 from lfd import make_world
 from lfd.core.errors import SimulationError, UnknownName
+from lfd.worlds import steppers
 from lfd.worlds.robosuite_world import RobosuiteWorld
 from lfd.worlds.robots import RobotConfig
 from lfd.worlds.steppers import CompiledStepper, make_stepper, uncovered
@@ -92,10 +93,13 @@ def test_a_singular_matrix_is_noticed_before_the_substep(lift_world) -> None:
     np.testing.assert_array_equal(lift_world.sim_state(), before)
 
 
-def test_what_is_not_covered_is_named(lift_world) -> None:
+def test_what_is_not_covered_is_named(lift_world, monkeypatch) -> None:
     robosuite_world = make_world("Lift", "panda", 20, "robosuite")
     assert robosuite_world.step_backend == robosuite_world.spec.stepper == "robosuite"
     assert uncovered(robosuite_world._env) == ""
+    with monkeypatch.context() as other:
+        other.setattr(steppers, "MUJOCO", "0.0.0")
+        assert "only 0.0.0" in uncovered(robosuite_world._env)
     robosuite_world._env.lite_physics = False
     assert uncovered(robosuite_world._env) == "lite_physics=False"
     with pytest.raises(SimulationError, match="does not cover lite_physics=False"):

@@ -1,7 +1,7 @@
 """A low-dimensional LeRobot v3 dataset as tensors in memory.
 
 The numbers of such a dataset are few (a thousand episodes of 200 frames with 30 numbers are 24 MB), so they
-are read once and sampled by indexing; opening a file for each item would cost a hundred times as much.
+are read once and sampled by indexing, instead of being looked up in files item by item.
 """
 
 import json

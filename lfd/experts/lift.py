@@ -10,7 +10,7 @@ can be asked in any state, also in one that it would never have reached (DAgger 
 The funnel makes the action change gradually with the state: the further the gripper is beside the cube, the
 higher it stays. The gripper points down along the axes of the world whatever the cube's yaw is: its pads hold
 a cube by its edges as well as by its sides, and turning to the sides would make the action jump at each
-eighth of a turn, which costs an imitator most of its demonstrations.
+eighth of a turn, which an imitator learns badly from few demonstrations.
 """
 
 import numpy as np

@@ -77,7 +77,9 @@ def record(
     Raises `OutputError` when `out` holds something already, `LfdError` when too many attempts fail.
     """
     check_output(out, overwrite=overwrite)
-    world = make_world(recipe.task, recipe.robot, recipe.control_hz)
+    with progress("build world", 1) as bar:  # the first time on a machine, the control step is compiled
+        world = make_world(recipe.task, recipe.robot, recipe.control_hz)
+        bar.advance()
     policy: Policy = make_expert(world.spec)
     if recipe.action_noise > 0:
         policy = NoisyPolicy(policy, scale=recipe.action_noise)

@@ -72,8 +72,10 @@ def evaluate(
     used = {**about["recipe"], "eval": as_table(recipe)}
     began, rows = time.perf_counter(), []
     with new_folder(out, overwrite=overwrite) as part:
-        world = make_world(about["task"], about["robot"], about["control_hz"])
-        learned = LearnedPolicy(policy, world.spec)
+        with progress("build world", 1) as bar:
+            world = make_world(about["task"], about["robot"], about["control_hz"])
+            learned = LearnedPolicy(policy, world.spec)
+            bar.advance()
         (part / "episodes").mkdir()
         with progress(f"evaluate {about['task']}", recipe.episodes) as bar:
             for index in range(recipe.episodes):

@@ -26,14 +26,8 @@ import numpy as np
 from numba import njit, types
 
 LIBRARY = next(Path(mujoco.__file__).parent.glob("libmujoco*"))
-MUJOCO = "3.3.7"
-"""The version whose C signatures stand below; another one could crash the process."""
 NULL_STIFFNESS = 10.0
 
-if mujoco.__version__ != MUJOCO:
-    raise ImportError(
-        f"the compiled step knows mujoco {MUJOCO}, this is {mujoco.__version__}; install requirements.lock"
-    )
 llvmlite.binding.load_library_permanently(str(LIBRARY))
 
 _address = types.intp

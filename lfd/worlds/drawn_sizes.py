@@ -1,6 +1,6 @@
 """Sizes that robosuite draws while it loads a model, drawn into the model that is there.
 
-A reset that rebuilds the model costs a hundred times as much as one that does not; what changes in between are
+A reset that rebuilds the model costs tens of times as much as one that does not; what changes in between are
 the half-sizes of a few boxes. They are set in mjModel to what the compiler would have computed, bit for bit.
 """
 

@@ -8,6 +8,9 @@ from jaxtyping import Float
 
 from lfd.core.errors import SimulationError, UnknownName
 
+MUJOCO = "3.3.7"
+"""The version whose C functions the compiled step calls; another one's signatures could crash the process."""
+
 
 class Stepper(Protocol):
     """Advances an environment's physics by one control step; mjData is fresh (mj_step1) before and after."""
@@ -151,6 +154,8 @@ class CompiledStepper:
 
 def uncovered(env: Any) -> str:
     """What of an environment the compiled step does not cover; empty when it covers everything."""
+    if mujoco.__version__ != MUJOCO:
+        return f"mujoco {mujoco.__version__}, only {MUJOCO}"
     if len(env.robots) != 1 or list(env.robots[0].arms) != ["right"]:
         return "more than one arm"
     if not env.lite_physics:
