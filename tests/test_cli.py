@@ -166,6 +166,31 @@ def test_ctrl_c_keeps_finished_episodes(tmp_path) -> None:
     assert list(out.glob("*.part")) == []
 
 
+@pytest.mark.parametrize("command", ["record", "convert", "replay"])
+def test_a_disk_that_takes_no_more_leaves_nothing_half_written(command, thread, tmp_path) -> None:
+    """A limit on the size of files stands for the full disk: writes fail in the same places."""
+    import resource
+
+    arguments = {
+        "record": ["record", str(LIFT), "--episodes", "1", "--out", str(tmp_path / "out")],
+        "convert": ["convert", str(thread.recordings), "--out", str(tmp_path / "out")],
+        "replay": ["replay", str(thread.recordings), "--save", str(tmp_path / "out.rrd")],
+    }[command]
+    done = subprocess.run(
+        [sys.executable, "-m", "lfd.cli", *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096)),
+    )
+    assert done.returncode == 2, done.stderr
+    assert "cannot write" in done.stderr
+    assert "Traceback" not in done.stderr
+    left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+    assert left == (["manifest.json"] if command == "record" else [])
+
+
 @pytest.mark.slow
 def test_doctor_examines_this_machine() -> None:
     found = call_json(["doctor"])

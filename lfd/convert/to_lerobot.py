@@ -88,7 +88,10 @@ def convert(
                     frames += _add(dataset, episode, recipe)
                     bar.advance(note=f"{frames} frames")
         finally:
-            dataset.finalize()  # LeRobot would otherwise write when the object is collected, folder or not
+            try:
+                dataset.finalize()
+            finally:  # LeRobot's destructors would write again, into a folder that is gone
+                dataset.writer._finalized = dataset.meta._finalized = True
         compared = _verify(part, out.name, paths, recipe, progress, dataset_class)
         (part / MODEL).write_text(first.model_xml, encoding="utf-8")
         hashes = {str(path): sha256(path) for path in paths}

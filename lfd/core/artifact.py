@@ -22,7 +22,7 @@ from typing import Any
 from lfd.core.errors import InputError, OutputError
 
 MANIFEST = "manifest.json"
-UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM}
+UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EFBIG}
 LIBRARIES = ("lfd", "lerobot", "robosuite", "mujoco", "numpy", "torch", "mcap", "rerun-sdk")
 
 

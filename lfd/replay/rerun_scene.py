@@ -32,11 +32,11 @@ def replay(clip: Clip, *, save: Path | None, overwrite: bool = False) -> None:
     recording = rr.RecordingStream("lfd", recording_id=clip.title)
     if save is None and sys.platform == "linux" and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
         raise OutputError("no screen to open the viewer on; write a file with --save X.rrd and open it elsewhere")
-    part = None if save is None else _new_file(save, overwrite)
-    if part is None:
+    if save is not None and save.exists() and not overwrite:
+        raise OutputError(f"{save} exists already; choose another --save, or add --overwrite to replace it")
+    file = None if save is None else recording.binary_stream()
+    if file is None:
         recording.spawn()
-    else:
-        recording.save(part)
     recording.send_recording_name(clip.title)
     recording.send_blueprint(_blueprint(clip))
     if clip.model is not None and clip.qpos is not None:
@@ -45,22 +45,24 @@ def replay(clip: Clip, *, save: Path | None, overwrite: bool = False) -> None:
     _log_paths(recording, clip)
     _log_curves(recording, clip)
     recording.flush()
-    if save is not None and part is not None:
-        recording.disconnect()
-        part.replace(save)
+    if save is not None and file is not None:
+        _write(save, file.read() or b"")
 
 
-def _new_file(path: Path, overwrite: bool) -> Path:
-    """An empty file beside `path`, to take its place when it is whole."""
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path} exists already; choose another --save, or add --overwrite to replace it")
+def _write(path: Path, content: bytes) -> None:
+    """Write a file that appears under its name when it is whole.
+
+    Rerun's own file sink leaves a half-written file behind when the disk is full.
+    """
     part = path.with_name(path.name + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_bytes(b"")
+        part.write_bytes(content)
+        part.replace(path)
     except OSError as error:
-        raise OutputError(f"cannot write {path}: {error.strerror}; choose another --save") from error
-    return part
+        if part.is_file():
+            part.unlink()
+        raise OutputError(f"cannot write {path}: {error.strerror}; free space or choose another --save") from error
 
 
 def _blueprint(clip: Clip) -> rrb.Blueprint:
