@@ -66,8 +66,8 @@ def test_unknown_names_in_recipes(lfd_fails, tmp_path) -> None:
         path.write_text(lift.replace(old, new))
         return path
 
-    assert "unknown task 'Lft'; known: Lift" in lfd_fails("record", recipe('"Lift"', '"Lft"'), "--out", out)
-    assert "unknown robot 'pand'; known: panda" in lfd_fails("record", recipe('"panda"', '"pand"'), "--out", out)
+    assert "unknown task 'Lft'; known: Door, Lift" in lfd_fails("record", recipe('"Lift"', '"Lft"'), "--out", out)
+    assert "unknown robot 'pand'; known: baxter" in lfd_fails("record", recipe('"panda"', '"pand"'), "--out", out)
     error = lfd_fails("record", recipe("episodes = 50", "epsiodes = 50"), "--out", out)
     assert "unknown key" in error
     assert "Did you mean 'episodes'?" in error

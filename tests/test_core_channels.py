@@ -1,6 +1,6 @@
 import pytest
 
-from lfd.core.channels import CHANNELS, channel, object_names
+from lfd.core.channels import CHANNELS, channel
 from lfd.core.errors import UnknownName
 
 
@@ -12,7 +12,14 @@ def test_objects_are_filled_in() -> None:
 
 def test_names_of_channels_that_end_like_objects_are_not_objects() -> None:
     assert channel("joint_pos") is CHANNELS["joint_pos"]
-    assert object_names(["joint_pos", "ee_pos", "gripper_pos", "cube_pos", "cube_quat"]) == ["cube"]
+    assert channel("ee_quat") is CHANNELS["ee_quat"]
+
+
+def test_each_kind_of_channel_with_a_blank_is_found_by_its_ending() -> None:
+    assert channel("left_ee_pos").topic == "/left_ee_pose"
+    assert channel("robot1_ee_quat").feature == "observation.state"
+    assert channel("Door_qpos").topic == "/objects/Door/joints"
+    assert channel("handle_point").path == "plots/objects/handle/point"
 
 
 def test_unknown_channel_lists_the_known() -> None:

@@ -48,22 +48,40 @@ def test_the_same_seed_gives_the_same_start_bit_for_bit(lift_world) -> None:
     assert (lift_world.sim_state() != starts[0].sim).any()
 
 
-def test_a_reset_without_rebuilding_gives_robosuites_own_start(lift_world) -> None:
+@pytest.mark.parametrize(
+    "task", ["Lift", "TwoArmLift", "Door", "PickPlaceSingle", "TwoArmPegInHole", "TwoArmHandover", "TwoArmTransport"]
+)
+def test_a_reset_without_rebuilding_gives_robosuites_own_start(task) -> None:
     """Same draws: model, state and controllers equal those of robosuite's hard reset, bit for bit."""
-    for seed in range(4):
-        lift_world.reset(np.random.default_rng(seed))
-        ours, fields = lift_world.get_state(), model_fields(lift_world)
-        lift_world._is_guest = True  # robosuite rebuilds the model
-        lift_world.reset(np.random.default_rng(seed))
-        theirs = lift_world.get_state()
+    world = make_world(task, "panda", 20)
+    for seed in range(3):
+        world.reset(np.random.default_rng(seed))
+        ours, fields = world.get_state(), model_fields(world)
+        world._is_guest = True  # robosuite rebuilds the model
+        world.reset(np.random.default_rng(seed))
+        theirs = world.get_state()
         np.testing.assert_array_equal(ours.sim, theirs.sim)
-        both = ours.memory.keys() & theirs.memory.keys()
-        assert all(".action_" in key for key in ours.memory.keys() ^ both)  # constants that robosuite fills in late
-        for key in both:
+        for key in ours.memory.keys() & theirs.memory.keys():
             np.testing.assert_array_equal(ours.memory[key], theirs.memory[key], err_msg=key)
-        for name, values in model_fields(lift_world).items():
+        for name, values in model_fields(world).items():
             np.testing.assert_array_equal(fields[name], values, err_msg=name)
         assert sizes(ours.model_xml) == sizes(theirs.model_xml)
+
+
+@pytest.mark.parametrize(("task", "what"), [("Stack", "cubeA_pos"), ("Wipe", "joint_pos")])
+def test_where_loading_draws_what_it_does_not_use_the_distribution_is_robosuites(task, what) -> None:
+    """Stack draws sizes of a single value while loading, Wipe dirt that it moves at once."""
+    from scipy.stats import kstest
+
+    world, starts = make_world(task, "panda", 20), {}
+    for rebuilds in (False, True):
+        drawn = []
+        for seed in range(25):
+            world._is_guest = rebuilds
+            drawn.append(world.reset(np.random.default_rng(100 * rebuilds + seed))[what][:2])
+        starts[rebuilds] = np.array(drawn)
+    for axis in (0, 1):
+        assert kstest(starts[False][:, axis], starts[True][:, axis])[1] > 0.01
 
 
 def model_fields(world) -> dict[str, np.ndarray]:
@@ -135,7 +153,9 @@ def test_an_action_that_does_not_fit_never_reaches_physics(lift_world, action, m
 
 
 def test_unknown_names_list_the_known() -> None:
-    with pytest.raises(UnknownName, match="unknown task 'Lif'; known: Lift. Did you mean 'Lift'"):
+    with pytest.raises(UnknownName, match="unknown task 'Lif'; known: Door, Lift, .*Did you mean 'Lift'"):
         make_world("Lif", "panda", 20)
-    with pytest.raises(UnknownName, match="unknown robot 'pandas'; known: panda."):
+    with pytest.raises(
+        UnknownName, match="unknown robot 'pandas'; known: baxter, iiwa, jaco, kinova3, panda, sawyer, ur5e."
+    ):
         make_world("Lift", "pandas", 20)

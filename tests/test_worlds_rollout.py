@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -66,14 +67,29 @@ class Log:
 def test_an_episode_ends_when_the_task_stays_solved() -> None:
     log = Log()
     outcome = rollout(Line(), Push(0.5), [log], np.random.default_rng(0), horizon=10, hold_steps=2)
-    assert outcome == Outcome(steps=3 + (outcome.steps == 4), success=True, reward=float(outcome.steps))
+    assert outcome == Outcome(
+        steps=3 + (outcome.steps == 4), success=True, reward=float(outcome.steps), clipped=0, failure=""
+    )
     assert log.events[0] == "begin"
     assert log.events[-2:] == [(outcome.steps - 1, True), "end True"]
 
 
 def test_an_episode_ends_at_the_horizon() -> None:
     outcome = rollout(Line(), Push(0.0), [], np.random.default_rng(0), horizon=10, hold_steps=1)
-    assert outcome == Outcome(steps=10, success=False, reward=10.0)
+    assert outcome == Outcome(steps=10, success=False, reward=10.0, clipped=0, failure="")
+
+
+class Fragile(Line):
+    """Its physics breaks beyond 0.5."""
+
+    def step(self, action):
+        result = super().step(action)
+        return replace(result, success=True, clipped=True, failure="it broke" if self.x > 0.5 else "")
+
+
+def test_an_episode_that_cannot_go_on_has_failed_with_the_reason() -> None:
+    outcome = rollout(Fragile(), Push(0.2), [], np.random.default_rng(0), horizon=10, hold_steps=1000)
+    assert outcome == Outcome(steps=3, success=False, reward=3.0, clipped=3, failure="it broke")
 
 
 def test_observers_hear_of_an_episode_that_is_broken_off() -> None:

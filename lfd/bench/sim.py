@@ -16,9 +16,11 @@ import numpy as np
 
 from lfd.core.protocols import Progress, silent
 from lfd.experts.registry import make_expert
-from lfd.worlds.robosuite_world import INTEGRATION, RobosuiteWorld, make_environment, make_world
+from lfd.worlds.environments import make_environment
+from lfd.worlds.robosuite_world import INTEGRATION, RobosuiteWorld, make_world
 from lfd.worlds.robots import load_robot
 from lfd.worlds.rollout import episode_rng
+from lfd.worlds.tasks import load_task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,8 +48,10 @@ def bench_sim(
     """
     world = make_world(task, robot, control_hz)
     stock = {
-        "robosuite": make_environment(task, load_robot(robot), control_hz),
-        "robosuite, lite_physics off": make_environment(task, load_robot(robot), control_hz, lite_physics=False),
+        "robosuite": make_environment(load_task(task), load_robot(robot), control_hz),
+        "robosuite, lite_physics off": make_environment(
+            load_task(task), load_robot(robot), control_hz, lite_physics=False
+        ),
     }
     expert, costs, resets = make_expert(world.spec), _Costs(), _Costs()
     substeps = round(1 / control_hz / world._model.opt.timestep)

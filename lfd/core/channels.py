@@ -25,7 +25,7 @@ class Channel:
     """One row of the table."""
 
     name: str
-    """Key in an observation; `{object}` stands for the name of an object of the task."""
+    """Key in an observation; `{object}` stands for the name of an object of the task, `{arm}` for one of two arms."""
     meaning: str
     """What the numbers are."""
     unit: str
@@ -44,9 +44,10 @@ class Channel:
     """Rerun entity of its plot."""
 
     def of(self, name: str) -> "Channel":
-        """This row with `{object}` filled in, for the channel called `name`."""
-        part = name.removesuffix(self.name.removeprefix("{object}")) if self.name != name else ""
-        filled = {key: value.replace("{object}", part) for key, value in vars(self).items() if value}
+        """This row with its blank, `{object}` or `{arm}`, filled in for the channel called `name`."""
+        blank, _, suffix = self.name.rpartition("}")
+        part = name.removesuffix(suffix)
+        filled = {key: value.replace(f"{blank}}}", part) for key, value in vars(self).items() if value}
         return Channel(**{**vars(self), **filled})
 
 
@@ -69,6 +70,10 @@ CHANNELS: dict[str, Channel] = {row.name: row for row in (
     _row("gripper_effort", "forces of the gripper's actuators", "N", "joint", "/joint_states", JOINT_STATE, "effort", STATE, "plots/gripper/effort"),
     _row("ee_pos", "position of the grip site", "m", "world", "/ee_pose", POSE, "position", STATE, "plots/ee/position"),
     _row("ee_quat", "orientation of the grip site, wxyz", "1", "world", "/ee_pose", POSE, "orientation", STATE, "plots/ee/orientation"),
+    _row("{arm}_ee_pos", "position of one of two grip sites", "m", "world", "/{arm}_ee_pose", POSE, "position", STATE, "plots/{arm}_ee/position"),
+    _row("{arm}_ee_quat", "orientation of one of two grip sites, wxyz", "1", "world", "/{arm}_ee_pose", POSE, "orientation", STATE, "plots/{arm}_ee/orientation"),
+    _row("{object}_qpos", "positions of an object's own joints", "rad or m", "joint", "/objects/{object}/joints", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/joints"),
+    _row("{object}_point", "position of a point of an object", "m", "world", "/objects/{object}/point", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/point"),
     _row("{object}_pos", "position of an object's body", "m", "world", "/objects/{object}/pose", POSE, "position", ENVIRONMENT_STATE, "plots/objects/{object}/position"),
     _row("{object}_quat", "orientation of an object's body, wxyz", "1", "world", "/objects/{object}/pose", POSE, "orientation", ENVIRONMENT_STATE, "plots/objects/{object}/orientation"),
     _row("sim_state", "MuJoCo's mjSTATE_INTEGRATION", "mixed", "model", "/sim/state", ARRAY, "data", None, ""),
@@ -87,15 +92,10 @@ def channel(name: str) -> Channel:
 
     Raises `UnknownName` for a name that no row matches.
     """
-    if name in CHANNELS and "{object}" not in name:
+    if name in CHANNELS and "{" not in name:
         return CHANNELS[name]
-    for template in ("{object}_pos", "{object}_quat"):
-        suffix = template.removeprefix("{object}")
-        if name.endswith(suffix) and len(name) > len(suffix):
-            return CHANNELS[template].of(name)
+    for template, row in CHANNELS.items():
+        blank, _, suffix = template.partition("}")
+        if suffix and blank.startswith("{") and name.endswith(suffix) and len(name) > len(suffix):
+            return row.of(name)
     raise UnknownName("channel", name, CHANNELS)
-
-
-def object_names(names: list[str]) -> list[str]:
-    """Names of the objects whose position is among the channels `names`, in order."""
-    return [n.removesuffix("_pos") for n in names if n.endswith("_pos") and n not in CHANNELS]

@@ -51,6 +51,10 @@ class StepResult:
     observation: Observation
     reward: float
     success: bool
+    clipped: bool = False
+    """Whether the action was beyond the controller's limits."""
+    failure: str = ""
+    """Why the episode cannot go on; empty as long as it can."""
 
 
 @runtime_checkable

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lfd.core.artifact import versions
-from lfd.core.channels import CHANNELS, JOINT_STATE, POSE, channel, object_names
+from lfd.core.channels import ARRAY, CHANNELS, JOINT_STATE, POSE, channel
 from lfd.core.episode import Episode, EpisodeMetadata
 from lfd.core.errors import EpisodeError, RecordingError
 from lfd.core.protocols import Observation, Transition, World
@@ -55,6 +55,10 @@ class McapRecorder:
         spec, origin = world.spec, self._origin
         self._writer = McapWriter(self._path)
         self._labels, self._hz = spec.labels, spec.control_hz
+        self._rows = {name: channel(name) for name in spec.labels if name != "action"}
+        names = spec.labels["action"]
+        self._grip_at = [at for at, name in enumerate(names) if name.endswith("gripper")]
+        self._grips = [names[at] for at in self._grip_at]
         self._start_ns = time.time_ns()
         about = EpisodeMetadata(
             task=spec.task,
@@ -81,7 +85,7 @@ class McapRecorder:
         self._writer.message("/task", self._start_ns, cdr.pack_string(spec.instruction))
         self._event(self._start_ns, "episode_begin", policy=origin.policy, seed=origin.seed, index=origin.index)
         self._write_observation(self._start_ns, observation, state.sim)
-        self._steps, self._reward = 0, 0.0
+        self._steps, self._reward, self._failure = 0, 0.0, ""
 
     def step(self, world: World, transition: Transition) -> None:
         now = self._start_ns + round(transition.step * 1e9 / self._hz)
@@ -89,21 +93,23 @@ class McapRecorder:
         decision, result = transition.decision, transition.result
         names = self._labels["action"]
         self._writer.message("/action", now, cdr.pack_array(names, decision.action))
-        self._writer.message("/gripper/command", now, cdr.pack_array(names[-1:], decision.action[-1:]))
+        if self._grips:
+            self._writer.message("/gripper/command", now, cdr.pack_array(self._grips, decision.action[self._grip_at]))
         if decision.expert_action is not None:
             self._writer.message(CHANNELS["expert_action"].topic, now, cdr.pack_array(names, decision.expert_action))
         numbers = np.array([result.reward, result.success, transition.done, decision.intervention], dtype=float)
         self._writer.message("/step", then, cdr.pack_array(STEP_LABELS, numbers))
         self._write_observation(then, result.observation, world.sim_state())
         self._steps, self._reward = transition.step + 1, self._reward + result.reward
+        self._failure = result.failure
 
     def end(self, success: bool) -> None:
         if not success and not self._keep_failures:
             self._writer.discard()
             return
         now = self._start_ns + round(self._steps * 1e9 / self._hz)
-        self._event(now, "episode_end", success=success, steps=self._steps)
-        facts = {"steps": self._steps, "success": success, "reward": self._reward}
+        self._event(now, "episode_end", success=success, steps=self._steps, failure=self._failure)
+        facts = {"steps": self._steps, "success": success, "reward": self._reward, "failure": self._failure}
         self._writer.metadata(END, {key: json.dumps(value) for key, value in facts.items()})
         self._writer.finish()
 
@@ -112,9 +118,7 @@ class McapRecorder:
             self._writer.discard()
 
     def _announce(self) -> None:
-        names = [name for name in self._labels if name != "action"]
-        rows = [channel(name) for name in (*names, "sim_state", "action", "expert_action")]
-        for row in rows:
+        for row in (*self._rows.values(), *(channel(name) for name in ("sim_state", "action", "expert_action"))):
             self._writer.channel(row.topic, row.schema, {"unit": row.unit, "frame": row.frame})
         self._writer.channel("/step", CHANNELS["reward"].schema, {"unit": "1", "frame": "task"})
         self._writer.channel("/gripper/command", CHANNELS["action"].schema, {"unit": "controller"})
@@ -126,17 +130,23 @@ class McapRecorder:
         self._writer.message("/events", now, cdr.pack_log(now, json.dumps({"event": event, **facts})))
 
     def _write_observation(self, now: int, seen: Observation, sim_state: np.ndarray) -> None:
-        def joined(kind: str) -> np.ndarray:
-            return np.concatenate([seen[f"{joints}_{kind}"] for joints in JOINT_KINDS])
+        kinds = [joints for joints in JOINT_KINDS if f"{joints}_pos" in self._labels]  # not every arm has a gripper
 
-        names = tuple(n for joints in JOINT_KINDS for n in self._labels[f"{joints}_pos"])
+        def joined(kind: str) -> np.ndarray:
+            return np.concatenate([seen[f"{joints}_{kind}"] for joints in kinds])
+
+        names = tuple(n for joints in kinds for n in self._labels[f"{joints}_pos"])
         state = cdr.JointState(names, joined("pos"), joined("vel"), joined("effort"))
         self._writer.message("/joint_states", now, cdr.pack_joint_state(now, state))
         frames = []
-        for body in ("ee", *object_names(list(self._labels))):
-            pose = seen[f"{body}_pos"], xyzw_from_wxyz(seen[f"{body}_quat"])
-            self._writer.message(channel(f"{body}_pos").topic, now, cdr.pack_pose(now, *pose))
-            frames.append((body, *pose))
+        for name, row in self._rows.items():
+            if row.schema == POSE and row.field == "position":
+                body = name.removesuffix("_pos")
+                pose = seen[name], xyzw_from_wxyz(seen[f"{body}_quat"])
+                self._writer.message(row.topic, now, cdr.pack_pose(now, *pose))
+                frames.append((body, *pose))
+            elif row.schema == ARRAY:
+                self._writer.message(row.topic, now, cdr.pack_array(self._labels[name], seen[name]))
         self._writer.message("/tf", now, cdr.pack_transforms(now, frames))
         self._writer.message("/sim/state", now, cdr.pack_array(("mjSTATE_INTEGRATION",), sim_state))
 
@@ -209,6 +219,8 @@ def _observed(content: McapContent, name: str, labels: tuple[str, ...]) -> np.nd
         poses = [cdr.unpack_pose(data) for _, data in messages]
         position, orientation = np.array([p for p, _ in poses]), np.array([q for _, q in poses])
         return position if row.field == "position" else wxyz_from_xyzw(orientation)
+    if row.schema == ARRAY:
+        return _array(content, row.topic)[1]
     assert row.schema == JOINT_STATE
     states = [cdr.unpack_joint_state(data) for _, data in messages]
     columns = [states[0].name.index(label) for label in labels]

@@ -3,18 +3,22 @@
 robosuite computes the torques of every physics substep in Python, which takes nine tenths of a control step.
 Here the loop
 
-    repeat: torques of the arm's controller -> mj_step2 -> mj_step1
+    repeat: torques of every arm's controller -> mj_step2 -> mj_step1
 
-is compiled with numba and calls the libmujoco of the `mujoco` wheel through its C functions. It covers
-operational space control (OSC_POSE, OSC_POSITION) of one arm on a fixed base with a gripper.
+is compiled with numba and calls the libmujoco of the `mujoco` wheel through its C functions. It covers any
+number of arms, each with a gripper or none, and these controllers (robosuite's `osc.py` and
+`joint_*.py`; `M`, `bias` of the arm's own joints):
 
-    tau = J^T [L_p F; L_o T] + bias + N^T M (k_n (q_0 - q) - 2 sqrt(k_n) q')        k_n = 10
-    F = k_p (x_goal - x) - k_d v,   T = k_p e(R_goal, R) - k_d w
-    L_p = (J_p M^-1 J_p^T)^-1,  L_o likewise,  N^T M a = M a - J^T (J M^-1 J^T)^-1 J a
+    OSC_POSE, OSC_POSITION   tau = J^T [L_p F; L_o T] + bias + N^T M (k_n (q_0 - q) - 2 sqrt(k_n) q')   k_n = 10
+                             F = k_p (x_goal - x) - k_d v,   T = k_p e(R_goal, R) - k_d w   (v, w relative to the base)
+                             L_p = (J_p M^-1 J_p^T)^-1,  L_o likewise,  N^T M a = M a - J^T (J M^-1 J^T)^-1 J a
+    JOINT_POSITION           tau = M (k_p (q_goal - q) - k_d q') + bias
+    JOINT_VELOCITY           tau = k_p e + k_i sum e + k_d mean of the last 5 changes of e + bias,   e = q'_goal - q'
+    JOINT_TORQUE             tau = tau_goal + bias
 
-(Khatib 1987, "A unified approach for motion and force control", eqs. 44-52; robosuite's `osc.py`). robosuite
-forms pseudo-inverses; here the same linear systems are solved by Cholesky factors. Where one is singular the
-substep is left to robosuite.
+(Khatib 1987, "A unified approach for motion and force control", eqs. 44-52 for the first.) robosuite forms
+pseudo-inverses; here the same linear systems are solved by Cholesky factors. Where one is singular the substep
+is left to robosuite.
 """
 
 from pathlib import Path
@@ -27,16 +31,22 @@ from numba import njit, types
 
 LIBRARY = next(Path(mujoco.__file__).parent.glob("libmujoco*"))
 NULL_STIFFNESS = 10.0
+OSC, JOINT_POSITION, JOINT_VELOCITY, JOINT_TORQUE = range(4)
+"""Kinds of controllers, as `Arms.kind` has them."""
+CHANGES = 5
+"""Length of JOINT_VELOCITY's buffer of changes of the error."""
 
 llvmlite.binding.load_library_permanently(str(LIBRARY))
 
 _address = types.intp
 mj_step1 = types.ExternalFunction("mj_step1", types.void(_address, _address))
 mj_step2 = types.ExternalFunction("mj_step2", types.void(_address, _address))
-mj_fullM = types.ExternalFunction("mj_fullM", types.void(_address, _address, _address))  # noqa: N816
 mj_jacSite = types.ExternalFunction(  # noqa: N816
     "mj_jacSite", types.void(_address, _address, _address, _address, types.int32)
 )
+
+compiled = njit(nogil=True, cache=True, error_model="numpy")
+inlined = njit(nogil=True, cache=True, error_model="numpy", inline="always")
 
 
 class Physics(NamedTuple):
@@ -44,46 +54,76 @@ class Physics(NamedTuple):
 
     model: int
     data: int
-    qM: int  # noqa: N815
     qpos: np.ndarray
     qvel: np.ndarray
     ctrl: np.ndarray
+    qM: np.ndarray  # noqa: N815
     qfrc_bias: np.ndarray
     site_xpos: np.ndarray
     site_xmat: np.ndarray
-    jac_pos: np.ndarray
-    jac_rot: np.ndarray
-    mass: np.ndarray
 
 
-class Arm(NamedTuple):
-    """An arm's operational space controller, as robosuite configured it."""
+class Arms(NamedTuple):
+    """The arms and their controllers as robosuite configured them.
 
-    site: int
+    The first axis of every array is the arm. A second axis is its joint (n), or the component of its action
+    or of its gains (w); what an arm does not have is never read.
+    """
+
+    kind: np.ndarray
+    joints: np.ndarray
+    """Number of joints of each arm."""
+    site: np.ndarray
     qpos: np.ndarray
     qvel: np.ndarray
     actuators: np.ndarray
     torque_low: np.ndarray
     torque_high: np.ndarray
+    mass_at: np.ndarray
+    """Where the entries of the arm's mass matrix stand in mjData's sparse one, (arms, n, n); -1 for a zero."""
     kp: np.ndarray
     kd: np.ndarray
+    ki: np.ndarray
+    action_at: np.ndarray
+    """Where the arm's part of the action begins, and how long it is."""
+    width: np.ndarray
     input_low: np.ndarray
     input_high: np.ndarray
     scale: np.ndarray
     input_middle: np.ndarray
     output_middle: np.ndarray
-    turns: bool
+    goal_low: np.ndarray
+    """Limits of the scaled goal of the joint controllers: velocities, torques or positions."""
+    goal_high: np.ndarray
+    turns: np.ndarray
     """Whether the action turns the hand (OSC_POSE)."""
-    uncoupled: bool
-    base_pos: np.ndarray
-    base_mat: np.ndarray
+    uncoupled: np.ndarray
+    base_site: np.ndarray
+    """Site of the frame in which the action moves the hand, and whether that frame moves (an IIWA's turns with
+    its first joint)."""
+    base_moves: np.ndarray
+
+
+class Grippers(NamedTuple):
+    """The grippers: each control step moves a gripper's position by `step` along the sign of its action.
+
+    A position of -1 to 1 is mapped linearly onto the range of the actuator's control.
+    """
+
+    action_at: np.ndarray
+    actuators: np.ndarray
+    """(grippers, fingers), -1 where a gripper has fewer fingers."""
+    step: np.ndarray
+    middle: np.ndarray
+    reach: np.ndarray
+    position: np.ndarray
 
 
 class Memory(NamedTuple):
-    """What the controller keeps between control steps."""
+    """What the controllers keep between control steps, and what they have computed of the present state."""
 
-    stale: bool
-    """Whether the first substep takes the arrays below, as robosuite does after a reset."""
+    stale: np.ndarray
+    """Whether the first substep takes the arrays below as they are, as robosuite does after a reset."""
     rest: np.ndarray
     """Joint positions that the null space is drawn to [rad]."""
     joint_pos: np.ndarray
@@ -91,43 +131,79 @@ class Memory(NamedTuple):
     position: np.ndarray
     rotation: np.ndarray
     velocity: np.ndarray
-    spin: np.ndarray
+    """Linear and angular velocity of the hand, (arms, 6)."""
     jacobian: np.ndarray
+    """Transposed, (arms, n, 6)."""
     mass: np.ndarray
+    goal_pos: np.ndarray
+    """Goal of OSC in the frame of the base: position, and rotation matrix."""
+    goal_mat: np.ndarray
+    goal: np.ndarray
+    """Goal of the joint controllers, (arms, n)."""
+    last_error: np.ndarray
+    error_sum: np.ndarray
+    changes: np.ndarray
+    """Ring buffer of the changes of the error, (arms, 5, n); where it was last written; how many it holds."""
+    newest: np.ndarray
+    filled: np.ndarray
+    saturated: np.ndarray
 
 
-@njit(nogil=True, cache=True)
-def _factor(a: np.ndarray) -> bool:
-    """Cholesky factor of a symmetric matrix in its lower triangle; False when it is not positive definite."""
-    n = a.shape[0]
+class Scratch(NamedTuple):
+    """Room for intermediate results."""
+
+    jac_pos: np.ndarray
+    jac_rot: np.ndarray
+    factor: np.ndarray
+    spread: np.ndarray
+    inertia: np.ndarray
+    block: np.ndarray
+    tau: np.ndarray
+    pull: np.ndarray
+    wrench: np.ndarray
+    lost: np.ndarray
+    speed: np.ndarray
+    goal_pos: np.ndarray
+    goal_mat: np.ndarray
+
+
+@compiled
+def _factor(a: np.ndarray, n: int) -> bool:
+    """Cholesky factor of a symmetric matrix in its lower triangle, the diagonal inverted.
+
+    False when the matrix is not positive definite.
+    """
     for j in range(n):
+        pivot = a[j, j]
         for k in range(j):
-            a[j, j] -= a[j, k] * a[j, k]
-        if not a[j, j] > 1e-14:
+            pivot -= a[j, k] * a[j, k]
+        if not pivot > 1e-14:
             return False
-        a[j, j] = np.sqrt(a[j, j])
+        a[j, j] = 1.0 / np.sqrt(pivot)
         for i in range(j + 1, n):
+            entry = a[i, j]
             for k in range(j):
-                a[i, j] -= a[i, k] * a[j, k]
-            a[i, j] /= a[j, j]
+                entry -= a[i, k] * a[j, k]
+            a[i, j] = entry * a[j, j]
     return True
 
 
-@njit(nogil=True, cache=True)
-def _solve(factor: np.ndarray, b: np.ndarray) -> None:
-    """Solve in place with a Cholesky factor."""
-    n = factor.shape[0]
+@compiled
+def _solve(factor: np.ndarray, b: np.ndarray, n: int, start: int) -> None:
+    """Solve in place, for `n` numbers of `b` from `start` on, with what `_factor` made."""
     for i in range(n):
+        value = b[start + i]
         for k in range(i):
-            b[i] -= factor[i, k] * b[k]
-        b[i] /= factor[i, i]
+            value -= factor[i, k] * b[start + k]
+        b[start + i] = value * factor[i, i]
     for i in range(n - 1, -1, -1):
+        value = b[start + i]
         for k in range(i + 1, n):
-            b[i] -= factor[k, i] * b[k]
-        b[i] /= factor[i, i]
+            value -= factor[k, i] * b[start + k]
+        b[start + i] = value * factor[i, i]
 
 
-@njit(nogil=True, cache=True)
+@compiled
 def _rotation(turn: np.ndarray) -> np.ndarray:
     """Rotation matrix of a rotation vector [rad], through a quaternion in single precision.
 
@@ -150,129 +226,219 @@ def _rotation(turn: np.ndarray) -> np.ndarray:
     )
 
 
-@njit(nogil=True, cache=True)
-def _present(p: Physics, arm: Arm, m: Memory) -> None:
-    """Write the arm's present pose, velocity, Jacobian and mass matrix over the memory's arrays."""
-    mj_jacSite(p.model, p.data, p.jac_pos.ctypes.data, p.jac_rot.ctypes.data, arm.site)
-    mj_fullM(p.model, p.mass.ctypes.data, p.qM)
-    m.position[:] = p.site_xpos[arm.site]
-    for i in range(3):
-        m.velocity[i] = m.spin[i] = 0.0
-        for j in range(3):
-            m.rotation[i, j] = p.site_xmat[arm.site, 3 * i + j]
-        for k in range(p.qvel.shape[0]):
-            m.velocity[i] += p.jac_pos[i, k] * p.qvel[k]
-            m.spin[i] += p.jac_rot[i, k] * p.qvel[k]
-        for k in range(arm.qvel.shape[0]):
-            m.jacobian[i, k] = p.jac_pos[i, arm.qvel[k]]
-            m.jacobian[3 + i, k] = p.jac_rot[i, arm.qvel[k]]
-    for i in range(arm.qvel.shape[0]):
-        m.joint_pos[i], m.joint_vel[i] = p.qpos[arm.qpos[i]], p.qvel[arm.qvel[i]]
-        for k in range(arm.qvel.shape[0]):
-            m.mass[i, k] = p.mass[arm.qvel[i], arm.qvel[k]]
+@inlined
+def _present(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> None:
+    """Write what arm `a`'s controller needs of the present state over the memory's arrays."""
+    n = arms.joints[a]
+    for i in range(n):
+        m.joint_pos[a, i], m.joint_vel[a, i] = p.qpos[arms.qpos[a, i]], p.qvel[arms.qvel[a, i]]
+    kind = arms.kind[a]
+    if kind != JOINT_VELOCITY and kind != JOINT_TORQUE:
+        for i in range(n):
+            for j in range(n):
+                at = arms.mass_at[a, i, j]
+                m.mass[a, i, j] = p.qM[at] if at >= 0 else 0.0
+    if kind == OSC:
+        site = arms.site[a]
+        mj_jacSite(p.model, p.data, s.jac_pos.ctypes.data, s.jac_rot.ctypes.data, site)
+        for i in range(3):
+            m.position[a, i] = p.site_xpos[site, i]
+            for j in range(3):
+                m.rotation[a, i, j] = p.site_xmat[site, 3 * i + j]
+        for i in range(6):
+            m.velocity[a, i] = 0.0
+        for k in range(n):
+            column, speed = arms.qvel[a, k], m.joint_vel[a, k]
+            for i in range(3):
+                m.jacobian[a, k, i] = s.jac_pos[i, column]
+                m.jacobian[a, k, 3 + i] = s.jac_rot[i, column]
+            for i in range(6):
+                m.velocity[a, i] += m.jacobian[a, k, i] * speed
 
 
-@njit(nogil=True, cache=True)
-def _goal(arm: Arm, m: Memory, action: np.ndarray, goal_pos: np.ndarray, goal_mat: np.ndarray) -> None:
-    """The world pose that an action asks for: the present one, moved in the frame of the base."""
-    change = np.zeros(6)
-    for i in range(6 if arm.turns else 3):
-        bounded = min(max(action[i], arm.input_low[i]), arm.input_high[i])
-        change[i] = (bounded - arm.input_middle[i]) * arm.scale[i] + arm.output_middle[i]
-    turn, base = _rotation(change[3:]), arm.base_mat
+@inlined
+def _set_goal(p: Physics, arms: Arms, a: int, m: Memory, action: np.ndarray) -> None:
+    """What arm `a`'s part of an action asks for; an OSC goal is the present pose, moved, in the base's frame."""
+    change = np.zeros(max(6, arms.width[a]))
+    for i in range(arms.width[a]):
+        bounded = min(max(action[arms.action_at[a] + i], arms.input_low[a, i]), arms.input_high[a, i])
+        change[i] = (bounded - arms.input_middle[a, i]) * arms.scale[a, i] + arms.output_middle[a, i]
+    if arms.kind[a] == OSC:
+        turn = _rotation(change[3:6] if arms.turns[a] else np.zeros(3))
+        base = arms.base_site[a]
+        for i in range(3):
+            m.goal_pos[a, i] = change[i]
+            for j in range(3):
+                m.goal_pos[a, i] += p.site_xmat[base, 3 * j + i] * (m.position[a, j] - p.site_xpos[base, j])
+                m.goal_mat[a, i, j] = 0.0
+                for k in range(3):
+                    for c in range(3):
+                        m.goal_mat[a, i, j] += turn[i, k] * p.site_xmat[base, 3 * c + k] * m.rotation[a, c, j]
+    else:
+        for i in range(arms.joints[a]):
+            goal = change[i] + (m.joint_pos[a, i] if arms.kind[a] == JOINT_POSITION else 0.0)
+            m.goal[a, i] = min(max(goal, arms.goal_low[a, i]), arms.goal_high[a, i])
+
+
+@inlined
+def _osc(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> bool:
+    """Torques of operational space control, without the bias, in `s.tau`; False when a matrix is singular."""
+    n, jac, mass, rotation, goal_mat = arms.joints[a], m.jacobian[a], m.mass[a], m.rotation[a], s.goal_mat
+    base = arms.base_site[a]
     for i in range(3):
-        goal_pos[i] = m.position[i]
+        s.goal_pos[i] = p.site_xpos[base, i]
         for j in range(3):
-            goal_pos[i] += base[i, j] * change[j]
+            s.goal_pos[i] += p.site_xmat[base, 3 * i + j] * m.goal_pos[a, j]
             goal_mat[i, j] = 0.0
             for k in range(3):
-                for a in range(3):
-                    for b in range(3):
-                        goal_mat[i, j] += base[i, k] * turn[k, a] * base[b, a] * m.rotation[b, j]
-
-
-@njit(nogil=True, cache=True)
-def _torques(
-    arm: Arm, m: Memory, goal_pos: np.ndarray, goal_mat: np.ndarray, bias: np.ndarray, tau: np.ndarray
-) -> bool:
-    """The controller's equation (see the module); False when a matrix is singular."""
-    n, jac = arm.qvel.shape[0], m.jacobian
-    wrench, away = np.zeros(6), np.zeros(3)
+                goal_mat[i, j] += p.site_xmat[base, 3 * i + k] * m.goal_mat[a, k, j]
+    for i in range(6):
+        s.speed[i] = m.velocity[a, i]
+    if arms.base_moves[a]:
+        mj_jacSite(p.model, p.data, s.jac_pos.ctypes.data, s.jac_rot.ctypes.data, base)
+        for k in range(n):
+            column = arms.qvel[a, k]
+            for i in range(3):
+                s.speed[i] -= s.jac_pos[i, column] * p.qvel[column]
+                s.speed[3 + i] -= s.jac_rot[i, column] * p.qvel[column]
     for i in range(3):  # e(R_goal, R) = 1/2 sum of the cross products of their columns
         j, k = (i + 1) % 3, (i + 2) % 3
+        away = 0.0
         for c in range(3):
-            away[i] += 0.5 * (m.rotation[j, c] * goal_mat[k, c] - m.rotation[k, c] * goal_mat[j, c])
-    for i in range(3):
-        wrench[i] = arm.kp[i] * (goal_pos[i] - m.position[i]) - arm.kd[i] * m.velocity[i]
-        wrench[3 + i] = arm.kp[3 + i] * away[i] - arm.kd[3 + i] * m.spin[i]
+            away += 0.5 * (rotation[j, c] * goal_mat[k, c] - rotation[k, c] * goal_mat[j, c])
+        s.wrench[i] = arms.kp[a, i] * (s.goal_pos[i] - m.position[a, i]) - arms.kd[a, i] * s.speed[i]
+        s.wrench[3 + i] = arms.kp[a, 3 + i] * away - arms.kd[a, 3 + i] * s.speed[3 + i]
 
-    factor = m.mass.copy()
-    if not _factor(factor):
+    for i in range(n):
+        for j in range(i + 1):
+            s.factor[i, j] = mass[i, j]
+    if not _factor(s.factor, n):
         return False
-    spread = np.empty((6, n))  # rows J_i M^-1
-    for i in range(6):
-        spread[i] = jac[i]
-        _solve(factor, spread[i])
-    inertia = np.zeros((6, 6))  # J M^-1 J^T
-    for i in range(6):
-        for j in range(6):
-            for k in range(n):
-                inertia[i, j] += spread[i, k] * jac[j, k]
-    full = inertia.copy()
-    if not _factor(full):
-        return False
-    if arm.uncoupled:
-        for start in (0, 3):
-            block = inertia[start : start + 3, start : start + 3].copy()
-            if not _factor(block):
-                return False
-            _solve(block, wrench[start : start + 3])
-    else:
-        _solve(full, wrench)
-
-    pull, lost = np.empty(n), np.zeros(6)
-    for k in range(n):
-        pull[k] = NULL_STIFFNESS * (m.rest[k] - m.joint_pos[k]) - 2 * np.sqrt(NULL_STIFFNESS) * m.joint_vel[k]
-    for i in range(6):
-        for k in range(n):
-            lost[i] += jac[i, k] * pull[k]
-    _solve(full, lost)
-    for k in range(n):
-        tau[k] = bias[arm.qvel[k]]
+    for k in range(n):  # spread = L^-1 J^T with M = L L^T
         for i in range(6):
-            tau[k] += jac[i, k] * (wrench[i] - lost[i])
+            entry = jac[k, i]
+            for j in range(k):
+                entry -= s.factor[k, j] * s.spread[j, i]
+            s.spread[k, i] = entry * s.factor[k, k]
+    for i in range(6):  # J M^-1 J^T = spread^T spread, of which the lower triangle is enough
+        for j in range(i + 1):
+            entry = 0.0
+            for k in range(n):
+                entry += s.spread[k, i] * s.spread[k, j]
+            s.inertia[i, j] = entry
+    if arms.uncoupled[a]:
+        for start in (0, 3):
+            for i in range(3):
+                for j in range(i + 1):
+                    s.block[i, j] = s.inertia[start + i, start + j]
+            if not _factor(s.block, 3):
+                return False
+            _solve(s.block, s.wrench, 3, start)
+        if not _factor(s.inertia, 6):
+            return False
+    else:
+        if not _factor(s.inertia, 6):
+            return False
+        _solve(s.inertia, s.wrench, 6, 0)
+
+    for i in range(6):
+        s.lost[i] = 0.0
+    for k in range(n):
+        s.pull[k] = (
+            NULL_STIFFNESS * (m.rest[a, k] - m.joint_pos[a, k]) - 2 * np.sqrt(NULL_STIFFNESS) * m.joint_vel[a, k]
+        )
+        for i in range(6):
+            s.lost[i] += jac[k, i] * s.pull[k]
+    _solve(s.inertia, s.lost, 6, 0)
+    for k in range(n):
+        tau = 0.0
+        for i in range(6):
+            tau += jac[k, i] * (s.wrench[i] - s.lost[i])
         for j in range(n):
-            tau[k] += m.mass[k, j] * pull[j]
+            tau += mass[k, j] * s.pull[j]
+        s.tau[k] = tau
     return True
 
 
-@njit(nogil=True, cache=True)
+@inlined
+def _velocity_control(arms: Arms, a: int, m: Memory, s: Scratch) -> None:
+    """Torques of JOINT_VELOCITY's PID controller, without the bias, in `s.tau`."""
+    m.newest[a] = (m.newest[a] + 1) % CHANGES
+    m.filled[a] = min(m.filled[a] + 1, CHANGES)
+    for i in range(arms.joints[a]):
+        error = m.goal[a, i] - m.joint_vel[a, i]
+        m.changes[a, m.newest[a], i] = error - m.last_error[a, i]
+        m.last_error[a, i] = error
+        if not m.saturated[a]:
+            m.error_sum[a, i] += error
+        change = 0.0
+        for k in range(m.filled[a]):
+            change += m.changes[a, k, i]
+        change /= m.filled[a]
+        s.tau[i] = arms.kp[a, i] * error + arms.ki[a, i] * m.error_sum[a, i] + arms.kd[a, i] * change
+
+
+@inlined
+def _torques(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> bool:
+    """Torques of arm `a`'s controller, without the bias, in `s.tau`; False when a matrix is singular."""
+    n, kind = arms.joints[a], arms.kind[a]
+    if kind == OSC:
+        return _osc(p, arms, a, m, s)
+    if kind == JOINT_VELOCITY:
+        _velocity_control(arms, a, m, s)
+    elif kind == JOINT_TORQUE:
+        for i in range(n):
+            s.tau[i] = m.goal[a, i]
+    else:
+        for i in range(n):
+            s.pull[i] = arms.kp[a, i] * (m.goal[a, i] - m.joint_pos[a, i]) - arms.kd[a, i] * m.joint_vel[a, i]
+        for i in range(n):
+            s.tau[i] = 0.0
+            for j in range(n):
+                s.tau[i] += m.mass[a, i, j] * s.pull[j]
+    return True
+
+
+@inlined
+def _close(p: Physics, grippers: Grippers, action: np.ndarray) -> None:
+    """Move the grippers' positions and write their controls, which do not change within a control step."""
+    for g in range(grippers.action_at.shape[0]):
+        for i in range(grippers.actuators.shape[1]):
+            if grippers.actuators[g, i] >= 0:
+                moved = grippers.position[g, i] + grippers.step[g, i] * np.sign(action[grippers.action_at[g]])
+                grippers.position[g, i] = min(max(moved, -1.0), 1.0)
+                p.ctrl[grippers.actuators[g, i]] = (
+                    grippers.middle[g, i] + grippers.reach[g, i] * grippers.position[g, i]
+                )
+
+
+@compiled
 def control_step(
-    p: Physics,
-    arm: Arm,
-    m: Memory,
-    action: np.ndarray,
-    goal_pos: np.ndarray,
-    goal_mat: np.ndarray,
-    start: int,
-    stop: int,
+    p: Physics, arms: Arms, grippers: Grippers, m: Memory, s: Scratch, action: np.ndarray, start: int, stop: int
 ) -> int:
     """Advance the physics by the substeps `start` to `stop` of one control step; returns the first not taken.
 
-    That is `stop`, unless a matrix is singular. Substep 0 sets the goal, a pose in the world frame that later
-    calls of the same control step hand in again. The gripper's controls stand in `p.ctrl` already: they do not
-    change within a step. Positions and velocities in mjData are fresh (mj_step1) before and after.
+    That is `stop`, unless a matrix is singular. Substep 0 sets the goals and moves the grippers. Positions and
+    velocities in mjData are fresh (mj_step1) before and after.
     """
-    tau = np.zeros(arm.qvel.shape[0])
+    if start == 0:
+        _close(p, grippers, action)
     for substep in range(start, stop):
-        if substep > 0 or not m.stale:
-            _present(p, arm, m)
-        if substep == 0:
-            _goal(arm, m, action, goal_pos, goal_mat)
-        if not _torques(arm, m, goal_pos, goal_mat, p.qfrc_bias, tau):
-            return substep
-        for k in range(tau.shape[0]):
-            p.ctrl[arm.actuators[k]] = min(max(tau[k], arm.torque_low[k]), arm.torque_high[k])
+        for a in range(arms.kind.shape[0]):
+            if not m.stale[a]:
+                _present(p, arms, a, m, s)
+            if substep == 0:
+                _set_goal(p, arms, a, m, action)
+            if not _torques(p, arms, a, m, s):
+                return substep
+            saturated = False
+            for k in range(arms.joints[a]):
+                actuator, tau = arms.actuators[a, k], s.tau[k] + p.qfrc_bias[arms.qvel[a, k]]
+                p.ctrl[actuator] = min(max(tau, arms.torque_low[a, k]), arms.torque_high[a, k])
+                saturated |= p.ctrl[actuator] != tau
+            m.saturated[a] = saturated
+        for a in range(arms.kind.shape[0]):
+            m.stale[a] = False
         mj_step2(p.model, p.data)
         mj_step1(p.model, p.data)
     return stop

@@ -1,97 +1,66 @@
-"""robosuite environments as worlds. The only module that imports robosuite.
+"""robosuite environments as worlds.
 
-robosuite builds the model, draws start states, runs its controllers and judges success; observations are
-read from MjData after the step, so that they belong to the state that the next action acts on (robosuite's
-own observables lag by one physics step). The control step itself is compiled where it can be
-(`lfd.worlds.steppers`).
+robosuite builds the model, draws start states, configures its controllers and judges reward and success;
+observations are read from MjData after the step (`lfd.worlds.observing`), so that they belong to the state that
+the next action acts on (robosuite's own observables lag by one physics step). The control step itself is
+compiled where it can be (`lfd.worlds.steppers`).
 """
 
 import logging
+import random
 import threading
-import warnings
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from lfd.core.channels import WXYZ, XYZ
-from lfd.core.errors import InputError, SimulationError, UnknownName
+from lfd.core.errors import InputError, SimulationError
 from lfd.core.protocols import Observation, StepResult, WorldSpec, WorldState
 from lfd.worlds.drawn_sizes import draw_sizes
+from lfd.worlds.environments import make_environment
+from lfd.worlds.observing import Sight
 from lfd.worlds.robots import CONTROLLERS, RobotConfig, load_robot
-from lfd.worlds.steppers import make_stepper, uncovered
-from lfd.worlds.tasks import TASKS
+from lfd.worlds.same_numbers import compare
+from lfd.worlds.steppers import action_start, arms_of, make_stepper, uncovered
+from lfd.worlds.tasks import Task, load_task
 
-SELF_CHECK_TOLERANCE = 1e-9
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+PLACED = ("body_pos", "body_quat")
+"""Fields of the model that a reset changes: where robosuite places what cannot move, such as a door."""
 logger = logging.getLogger(__name__)
-_GLOBAL_RANDOM = threading.Lock()  # robosuite 1.5.1 draws from numpy's global generator
-
-
-def import_robosuite() -> Any:
-    """robosuite, without its messages about optional parts that lfd does not use."""
-    logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", SyntaxWarning)  # escape sequences in robosuite's docstrings
-        import robosuite
-    return robosuite
-
-
-def make_environment(task: str, robot: RobotConfig, control_hz: int, **options: Any) -> Any:
-    """robosuite's own environment, without rendering; `options` go to `robosuite.make`."""
-    robosuite = import_robosuite()
-    from robosuite.controllers import load_composite_controller_config, load_part_controller_config
-
-    config: Any = load_composite_controller_config(controller="BASIC", robot=robot.robosuite_name)
-    arm = config["body_parts"]["right"]
-    config["body_parts"] = {"right": load_part_controller_config(default_controller=robot.controller)}
-    config["body_parts"]["right"] |= {key: arm[key] for key in ("gripper", "input_type", "input_ref_frame")}
-    return robosuite.make(
-        task,
-        robots=robot.robosuite_name,
-        controller_configs=config,
-        has_renderer=False,
-        has_offscreen_renderer=False,
-        use_camera_obs=False,
-        control_freq=control_hz,
-        ignore_done=True,
-        **options,
-    )
+_GLOBAL_RANDOM = threading.Lock()  # robosuite 1.5.1 draws from the global generators of numpy and Python
 
 
 class RobosuiteWorld:
-    """A robosuite task with one arm.
+    """A task of robosuite with a robot; what it observes is described in `lfd.worlds.observing`.
 
-    Observation channels: `joint_pos` [rad], `joint_vel` [rad/s], `joint_effort` [N m] of the arm,
-    `gripper_pos` [m], `gripper_vel` [m/s], `gripper_effort` [N] of the fingers, `ee_pos` [m] and `ee_quat`
-    (wxyz) of the grip site, and `NAME_pos` [m], `NAME_quat` (wxyz) of each object, poses in the world frame.
-    The action is the controller's input in [-1, 1] and the gripper's (-1 open, 1 close).
-
-    Raises `UnknownName` for a task that lfd does not know.
+    The action is the concatenation, arm by arm, of the controller's input in [-1, 1] and the gripper's (-1 open,
+    1 close).
     """
 
-    def __init__(self, *, task: str, robot_name: str, robot: RobotConfig, control_hz: int, stepper: str = "auto"):
-        if task not in TASKS:
-            raise UnknownName("task", task, TASKS)
+    def __init__(self, *, task: Task, robot_name: str, robot: RobotConfig, control_hz: int, stepper: str = "auto"):
         self._env = make_environment(task, robot, control_hz)
         for observable in self._env._observables.values():
             observable.set_enabled(False)  # read by nobody here
-        self._task, self._wanted = task, stepper
+        self._task, self._wanted, self._has_clipped = task, stepper, False
         self._attach()
         if stepper == "auto":
             self._choose_stepper()
+        low, high = self._env.action_spec
         self.spec = WorldSpec(
-            task=task,
-            instruction=TASKS[task],
+            task=task.name,
+            instruction=task.instruction,
             robot=robot_name,
             controller=robot.controller,
             control_hz=control_hz,
-            labels=self._labels(robot),
-            action_low=self._env.action_spec[0],
-            action_high=self._env.action_spec[1],
+            labels={**self._sight.labels, "action": self._action_names(robot)},
+            action_low=np.asarray(low, dtype=float),
+            action_high=np.asarray(high, dtype=float),
             stepper=self._stepper.name,
         )
 
@@ -108,44 +77,53 @@ class RobosuiteWorld:
         seed = int(rng.integers(2**32))
         self._env.hard_reset = self._is_guest
         with _GLOBAL_RANDOM:
-            outside = np.random.get_state()
+            outside, outside_python = np.random.get_state(), random.getstate()
             np.random.seed(seed)
+            random.seed(seed)
             try:
                 if not self._is_guest:
-                    draw_sizes(self._task, self._env)
+                    draw_sizes(self._task.name, self._env)
                 self._env.reset()
             finally:
                 np.random.set_state(outside)
+                random.setstate(outside_python)
         if self._is_guest:
             self._attach()
         self._model_xml = None
+        self._stepper.load()
         return self._observe()
 
     def step(self, action: Float[np.ndarray, "Da"]) -> StepResult:
-        """Apply an action for one control step; values outside the limits are clipped by the controller.
+        """Apply an action for one control step; what is beyond its limits is clipped, and said once.
 
-        Raises `InputError` for an action of another shape or one that is not finite, `SimulationError` when
-        the physics becomes unstable.
+        When MuJoCo reports that the physics became unstable, the world stays where it was before the step and
+        `failure` says why. Raises `InputError` for an action of another shape or one that is not finite.
         """
         expected = self.spec.action_low.shape
         if action.shape != expected:
             raise InputError(f"the action has shape {action.shape}, {self.spec.robot} takes {expected}")
         if not np.isfinite(action).all():
             raise InputError(f"the action is not finite: {action}")
-        self._stepper.step(action)
-        for kind in UNSTABLE:
-            if self._data.warning[kind].number:
-                raise SimulationError(f"MuJoCo reports {mujoco.mjtWarning(kind).name} at t = {self._data.time:.3f} s")
-        return StepResult(self._observe(), float(self._env.reward(action)), bool(self._env._check_success()))
+        clipped = bool((action < self.spec.action_low).any() or (action > self.spec.action_high).any())
+        if clipped and not self._has_clipped:
+            self._has_clipped = True
+            logger.warning("actions beyond the limits of %s are clipped, as robosuite does", self.spec.robot)
+        mujoco.mj_getState(self._model, self._data, self._before, INTEGRATION)
+        self._stepper.step(np.asarray(action, dtype=np.float64))
+        if self._warnings[self._unstable].any():
+            return self._broken_off(clipped)
+        reward, _, _ = self._env._post_action(action)
+        return StepResult(self._observe(), float(reward), bool(self._env._check_success()), clipped)
 
     def sim_state(self) -> Float[np.ndarray, "_"]:
         """MuJoCo's mjSTATE_INTEGRATION now."""
-        state = np.empty(mujoco.mj_stateSize(self._model, INTEGRATION))
+        state = np.empty(len(self._before))
         mujoco.mj_getState(self._model, self._data, state, INTEGRATION)
         return state
 
     def get_state(self) -> WorldState:
-        """Everything that decides the future: physics, controllers, gripper, and the model itself."""
+        """Everything that decides the future: physics, controllers, grippers, the task's own memory, the model."""
+        self._stepper.store()
         return WorldState(model_xml=self._portable_xml(), sim=self.sim_state(), memory=self._memory())
 
     def set_state(self, state: WorldState) -> Observation:
@@ -157,108 +135,170 @@ class RobosuiteWorld:
             with _GLOBAL_RANDOM:
                 self._env.reset_from_xml_string(state.model_xml)
             self._attach(state.model_xml)
-        expected = mujoco.mj_stateSize(self._model, INTEGRATION)
-        if state.sim.shape != (expected,):
-            raise SimulationError(f"the state has {state.sim.shape} numbers, the model's has {expected}")
-        sim = np.array(state.sim)  # MuJoCo wants an array that can be written
+        if state.sim.shape != self._before.shape:
+            raise SimulationError(f"the state has {state.sim.shape} numbers, the model's has {self._before.shape}")
+        self._set_memory(state.memory)
+        self._put(state.sim)
+        self._stepper.load()
+        return self._observe()
+
+    def _put(self, sim_state: np.ndarray) -> None:
+        """Set MuJoCo's state and compute what follows from it."""
+        sim = np.array(sim_state)  # MuJoCo wants an array that can be written
         for _ in range(2):  # mj_forward moves the solver's warm start, which is part of the state
             mujoco.mj_setState(self._model, self._data, sim, INTEGRATION)
             mujoco.mj_forward(self._model, self._data)
         mujoco.mj_setState(self._model, self._data, sim, INTEGRATION)
-        self._set_memory(state.memory)
-        return self._observe()
+        self._warnings[:] = 0
+
+    def _broken_off(self, clipped: bool) -> StepResult:
+        """The answer to an action that made the physics unstable: back to the state before it, with the reason."""
+        kinds = [mujoco.mjtWarning(k).name for k in UNSTABLE if self._warnings[k]]
+        self._put(self._before)
+        failure = f"MuJoCo reports {', '.join(kinds)} after t = {self._data.time:.3f} s"
+        return StepResult(self._observe(), 0.0, False, clipped, failure)
 
     def _attach(self, model_xml: str | None = None) -> None:
-        """Look up where the present model keeps what observations are read from."""
+        """Bind to the present model."""
         sim = self._env.sim
         self._model, self._data = sim.model._model, sim.data._data
         self._model_xml, self._is_guest = model_xml, model_xml is not None
-        robot = self._env.robots[0]
-        grip = robot.gripper["right"]
-        names = {"joint": robot.robot_model.arm_joints, "gripper": grip.joints}
-        self._joints = {kind: [self._model.joint(name) for name in joints] for kind, joints in names.items()}
-        self._qpos = {kind: np.array([j.qposadr[0] for j in joints]) for kind, joints in self._joints.items()}
-        self._qvel = {kind: np.array([j.dofadr[0] for j in joints]) for kind, joints in self._joints.items()}
-        self._grip_site = self._model.site(grip.important_sites["grip_site"]).id
-        self._objects = {o.name: self._model.body(o.root_body).id for o in self._env.model.mujoco_objects}
+        self._before = np.empty(mujoco.mj_stateSize(self._model, INTEGRATION))
+        self._warnings, self._unstable = self._data.warning.number, [int(kind) for kind in UNSTABLE]
+        self._compiled_places = {name: getattr(self._model, name).copy() for name in PLACED}
+        self._sight = Sight(self._env, self._task)
         self._stepper = make_stepper(self._wanted, self._env)
 
     def _choose_stepper(self) -> None:
         """Keep the compiled step if one step of it gives robosuite's numbers; say so and take robosuite's if not."""
-        start = self.get_state()
-        action = np.linspace(-0.5, 0.5, len(self._env.action_spec[0]))
-        states = {}
-        for name in dict.fromkeys((self._stepper.name, "robosuite")):
-            self.set_state(start)
-            make_stepper(name, self._env).step(action)
-            states[name] = np.concatenate([self._data.qpos, self._data.qvel, self._data.ctrl])
-        self.set_state(start)
-        away = float(np.abs(states[self._stepper.name] - states["robosuite"]).max())
-        if away > SELF_CHECK_TOLERANCE or self._stepper.name == "robosuite":
-            reason = uncovered(self._env) or f"this machine (one step differs by {away:.1e})"
+        reason = uncovered(self._env)
+        if not reason:
+            found = compare(self, [np.linspace(-0.5, 0.5, len(self._env.action_spec[0]))])
+            reason = "" if found.is_same else f"this machine (one step differs by {found.ours:.1e})"
+        if reason:
             logger.warning(
                 "robosuite's own step is used, several times slower: the compiled one does not cover %s", reason
             )
             self._wanted = "robosuite"
             self._stepper = make_stepper("robosuite", self._env)
 
-    def _labels(self, robot: RobotConfig) -> Mapping[str, tuple[str, ...]]:
-        labels: dict[str, tuple[str, ...]] = {}
-        for kind, joints in self._joints.items():
-            names = tuple(joint.name for joint in joints)
-            labels |= {f"{kind}_pos": names, f"{kind}_vel": names, f"{kind}_effort": names}
-        for body in ("ee", *self._objects):
-            labels |= {f"{body}_pos": XYZ, f"{body}_quat": WXYZ}
-        return labels | {"action": (*CONTROLLERS[robot.controller], "gripper")}
+    def _action_names(self, robot: RobotConfig) -> tuple[str, ...]:
+        """Names of the action's components; those of two arms begin with the arm's."""
+        names = np.empty(len(self._env.action_spec[0]), dtype=object)
+        arms = list(arms_of(self._env))
+        for prefix, (owner, arm) in zip(self._sight.prefixes, arms, strict=True):
+            part, gripper = owner.composite_controller.part_controllers[arm], owner.gripper[arm]
+            begin = action_start(self._env, owner, arm)
+            names[begin : begin + part.control_dim] = [
+                f"{prefix}{name}" for name in CONTROLLERS[robot.controller] or part.joint_names
+            ]
+            if gripper.dof:
+                names[action_start(self._env, owner, f"{arm}_gripper")] = f"{prefix}gripper"
+        return tuple(names)
 
     def _observe(self) -> Observation:
-        data, seen = self._data, {}
-        for kind in self._joints:
-            seen[f"{kind}_pos"] = data.qpos[self._qpos[kind]]
-            seen[f"{kind}_vel"] = data.qvel[self._qvel[kind]]
-            seen[f"{kind}_effort"] = data.qfrc_actuator[self._qvel[kind]]
-        seen["ee_pos"] = data.site_xpos[self._grip_site].copy()
-        seen["ee_quat"] = np.empty(4)
-        mujoco.mju_mat2Quat(seen["ee_quat"], data.site_xmat[self._grip_site])
-        for name, body in self._objects.items():
-            seen[f"{name}_pos"], seen[f"{name}_quat"] = data.xpos[body].copy(), data.xquat[body].copy()
-        return seen
+        return self._sight.named(self._sight.read().copy())
 
     def _portable_xml(self) -> str:
         """The model as XML, mesh and texture paths starting with `robosuite/`, numbers in full."""
         if self._model_xml is None:
+            self._write_places()
             assets = str(self._env.model.mujoco_arena.folder).partition("robosuite/models/assets")[0]
             self._model_xml = self._env.model.get_xml().replace(f'"{assets}robosuite/', '"robosuite/')
         return self._model_xml
 
+    def _write_places(self) -> None:
+        """Write where a reset placed what cannot move into the XML."""
+        moved = {
+            field: np.flatnonzero((getattr(self._model, field) != self._compiled_places[field]).any(axis=1))
+            for field in PLACED
+        }
+        if not any(len(bodies) for bodies in moved.values()):
+            return
+        elements: dict[str | None, ET.Element] = {e.get("name"): e for e in self._env.model.root.iter("body")}
+        for field, bodies in moved.items():
+            for body in bodies:
+                element = elements[self._model.body(body).name]
+                element.set(
+                    field.removeprefix("body_"), " ".join(repr(float(x)) for x in getattr(self._model, field)[body])
+                )
+
     def _parts(self) -> dict[str, Any]:
-        """What has a memory between control steps: the part controllers and the gripper."""
-        robot = self._env.robots[0]
-        return {**robot.composite_controller.part_controllers, "gripper": robot.gripper["right"]}
+        """What has a memory between control steps: the part controllers and the grippers."""
+        parts = {}
+        for robot in self._env.robots:
+            for name, part in robot.composite_controller.part_controllers.items():
+                parts[f"{robot.idn}.{name}"] = part
+            for arm, gripper in robot.gripper.items():
+                parts[f"{robot.idn}.{arm}_hand"] = gripper
+        return parts
 
     def _memory(self) -> dict[str, np.ndarray]:
-        """Goals, null-space targets, and the Jacobian and mass matrix that the first substep after a reset
-        still takes from the controllers' construction."""
+        """What robosuite's Python objects remember.
+
+        The controllers' goals, filters and null-space targets, and the Jacobian and mass matrix that the first
+        substep after a reset still takes from their construction; where a reset placed what cannot move; which
+        dirt is wiped.
+        """
         kept: dict[str, np.ndarray] = {}
         for part, holder in self._parts().items():
             for name, value in vars(holder).items():
                 if isinstance(value, np.ndarray) and value.dtype.kind == "f":
                     kept[f"{part}.{name}"] = value.copy()
-            if hasattr(holder, "new_update"):
-                kept[f"{part}.new_update"] = np.array(float(holder.new_update))
+            for name in FLAGS:
+                if hasattr(holder, name):
+                    kept[f"{part}.{name}"] = np.array(float(getattr(holder, name)))
+            if hasattr(holder, "derr_buf"):
+                buffer = holder.derr_buf
+                kept[f"{part}.derr_buf"] = np.append(buffer.buf, [buffer.ptr, buffer._size])
+        for field in PLACED:
+            if (getattr(self._model, field) != self._compiled_places[field]).any():
+                kept[f"model.{field}"] = getattr(self._model, field).copy()
+        if hasattr(self._env, "wiped_markers"):
+            wiped = {marker.name for marker in self._env.wiped_markers}
+            kept["task.wiped"] = np.array([float(m.name in wiped) for m in self._env.model.mujoco_arena.markers])
         return kept
 
     def _set_memory(self, memory: Mapping[str, np.ndarray]) -> None:
+        parts = self._parts()
         for key, value in memory.items():
-            part, _, name = key.partition(".")
-            setattr(self._parts()[part], name, bool(value) if name == "new_update" else np.array(value))
+            part, _, name = key.rpartition(".")
+            if part == "model":
+                getattr(self._model, name)[:] = value
+            elif part == "task":
+                self._wipe(value)
+            elif name == "derr_buf":
+                buffer = parts[part].derr_buf
+                buffer.buf, (buffer.ptr, buffer._size) = (
+                    value[:-2].reshape(buffer.buf.shape).copy(),
+                    value[-2:].astype(int),
+                )
+            else:
+                setattr(parts[part], name, bool(value) if name in FLAGS else np.array(value))
+
+    def _wipe(self, wiped: np.ndarray) -> None:
+        """Make the marked dirt of the Wipe task wiped, and the rest not."""
+        markers = self._env.model.mujoco_arena.markers
+        self._env.wiped_markers = [m for m, gone in zip(markers, wiped, strict=True) if gone]
+        for marker, gone in zip(markers, wiped, strict=True):
+            self._model.geom(marker.visual_geoms[0]).rgba[3] = 1.0 - gone
 
 
-def make_world(task: str, robot: str, control_hz: int, stepper: str = "auto") -> RobosuiteWorld:
+FLAGS = ("new_update", "saturated")
+"""Memories of controllers that are true or false."""
+
+
+def make_world(
+    task: str, robot: str, control_hz: int, stepper: str = "auto", *, controller: str | None = None
+) -> RobosuiteWorld:
     """The world of a task and a robot config, by their names.
 
     `stepper` is `compiled`, `robosuite`, or `auto`: the compiled one where it covers the robot and gives
-    robosuite's numbers. Raises `UnknownName` for a task, robot or stepper that lfd does not know.
+    robosuite's numbers. `controller` takes the place of the robot config's. Raises `UnknownName` for a task, robot,
+    controller or stepper that lfd does not know.
     """
-    config = load_robot(robot)
-    return RobosuiteWorld(task=task, robot_name=robot, robot=config, control_hz=control_hz, stepper=stepper)
+    known, config = load_task(task), load_robot(robot)
+    if controller is not None:
+        config = replace(config, controller=controller)
+        config.check(f"robot {robot}")
+    return RobosuiteWorld(task=known, robot_name=robot, robot=config, control_hz=control_hz, stepper=stepper)

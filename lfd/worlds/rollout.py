@@ -20,6 +20,10 @@ class Outcome:
     """Whether the task was solved, and stayed solved, at the end."""
     reward: float
     """Sum of the rewards, undiscounted."""
+    clipped: int
+    """Control steps whose action was beyond the controller's limits."""
+    failure: str
+    """Why the episode could not go on, where it was broken off; else empty."""
 
 
 def episode_rng(stage: str, seed: int, index: int) -> np.random.Generator:
@@ -49,7 +53,7 @@ def rollout(
     """
     observation = world.set_state(start) if start is not None else world.reset(rng)
     policy.reset(rng)
-    reward, held, step = 0.0, 0, 0
+    reward, held, clipped, step, failure = 0.0, 0, 0, 0, ""
     try:
         for observer in observers:
             observer.begin(world, observation)
@@ -58,13 +62,14 @@ def rollout(
             result = world.step(decision.action)
             reward += result.reward
             held = held + 1 if result.success else 0
-            done = held >= hold_steps or step + 1 == horizon
+            clipped, failure = clipped + result.clipped, result.failure
+            done = bool(failure) or held >= hold_steps or step + 1 == horizon
             for observer in observers:
                 observer.step(world, Transition(step, observation, decision, result, done))
             observation = result.observation
             if done:
                 break
-        outcome = Outcome(step + 1, held >= hold_steps, reward)
+        outcome = Outcome(step + 1, held >= hold_steps and not failure, reward, clipped, failure)
         for observer in observers:
             observer.end(outcome.success)
     except BaseException:

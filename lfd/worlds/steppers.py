@@ -1,5 +1,6 @@
 """What computes a control step of a robosuite environment: robosuite itself, or the compiled function."""
 
+from collections.abc import Iterator
 from typing import Any, Protocol
 
 import mujoco
@@ -10,18 +11,28 @@ from lfd.core.errors import SimulationError, UnknownName
 
 MUJOCO = "3.3.7"
 """The version whose C functions the compiled step calls; another one's signatures could crash the process."""
+OSC_NAMES = ("OSC_POSE", "OSC_POSITION")
+JOINT_NAMES = ("JOINT_POSITION", "JOINT_VELOCITY", "JOINT_TORQUE")
 
 
 class Stepper(Protocol):
-    """Advances an environment's physics by one control step; mjData is fresh (mj_step1) before and after."""
+    """Advances an environment's physics by one control step; mjData is fresh (mj_step1) before and after.
+
+    What the controllers remember may live in the stepper while it steps: `store` writes it into robosuite's
+    objects, `load` takes it from there.
+    """
 
     name: str
 
     def step(self, action: Float[np.ndarray, "Da"]) -> None: ...
 
+    def load(self) -> None: ...
+
+    def store(self) -> None: ...
+
 
 class RobosuiteStepper:
-    """robosuite's own step."""
+    """robosuite's own step, without its observables and its reward."""
 
     name = "robosuite"
 
@@ -29,8 +40,23 @@ class RobosuiteStepper:
         self._env = env
 
     def step(self, action: Float[np.ndarray, "Da"]) -> None:
-        self._env.step(action)
-        mujoco.mj_step1(self._env.sim.model._model, self._env.sim.data._data)
+        env, sim = self._env, self._env.sim
+        for substep in range(int(env.control_timestep / env.model_timestep)):
+            if env.lite_physics:
+                sim.step1()
+                env._pre_action(action, substep == 0)
+                sim.step2()
+            else:
+                sim.forward()
+                env._pre_action(action, substep == 0)
+                sim.step()
+        mujoco.mj_step1(sim.model._model, sim.data._data)
+
+    def load(self) -> None:
+        """robosuite's objects are the memory."""
+
+    def store(self) -> None:
+        """robosuite's objects are the memory."""
 
 
 class CompiledStepper:
@@ -47,134 +73,272 @@ class CompiledStepper:
         reason = uncovered(env)
         if reason:
             raise SimulationError(f"the compiled step does not cover {reason}")
-        self._env, self._robot = env, env.robots[0]
+        self._env, self._control_step = env, c.control_step
         model, data = env.sim.model._model, env.sim.data._data
-        self._gripper_actuators = np.array(self._robot._ref_actuators_indexes_dict["right_gripper"])
-        low, high = model.actuator_ctrlrange[self._gripper_actuators].T
-        self._gripper_middle, self._gripper_reach = 0.5 * (high + low), 0.5 * (high - low)
-        part, nv = self._part, model.nv
-        self._control_step = c.control_step
         self._physics = c.Physics(
             model=model._address,
             data=data._address,
-            qM=data.qM.ctypes.data,
-            qpos=data.qpos,
-            qvel=data.qvel,
-            ctrl=data.ctrl,
-            qfrc_bias=data.qfrc_bias,
-            site_xpos=data.site_xpos,
-            site_xmat=data.site_xmat,
-            jac_pos=np.empty((3, nv)),
-            jac_rot=np.empty((3, nv)),
-            mass=np.empty((nv, nv)),
+            **{name: getattr(data, name) for name in c.Physics._fields[2:]},
         )
-        part.scale_action(np.zeros(part.control_dim))  # fills in its scale
-        actuators = np.array(self._robot._ref_actuators_indexes_dict["right"])
-        self._arm = c.Arm(
-            site=env.sim.model.site_name2id(part.ref_name),
-            qpos=np.array(part.qpos_index),
-            qvel=np.array(part.qvel_index),
-            actuators=actuators,
-            torque_low=model.actuator_ctrlrange[actuators, 0].copy(),
-            torque_high=model.actuator_ctrlrange[actuators, 1].copy(),
-            kp=np.array(part.kp, dtype=float),
-            kd=np.array(part.kd, dtype=float),
-            input_low=np.array(part.input_min, dtype=float),
-            input_high=np.array(part.input_max, dtype=float),
-            scale=np.array(part.action_scale, dtype=float),
-            input_middle=np.array(part.action_input_transform, dtype=float),
-            output_middle=np.array(part.action_output_transform, dtype=float),
-            turns=bool(part.use_ori),
-            uncoupled=bool(part.uncoupling),
-            base_pos=np.array(part.origin_pos),
-            base_mat=np.array(part.origin_ori),
-        )
-        self._memory_class = c.Memory
+        arms = list(arms_of(env))
+        most = max(len(robot.composite_controller.part_controllers[arm].qpos_index) for robot, arm in arms)
+        self._arms = _stack(c.Arms, [_arm(env, robot, arm, max(most, 6)) for robot, arm in arms])
+        self._grippers = _stack(c.Grippers, [_gripper(env, robot, arm, model.nu) for robot, arm in arms])
+        self._fingers = (self._grippers.actuators >= 0).sum(axis=1)
+        self._memory = c.Memory(**_empty_memory(len(arms), max(most, 6), c.CHANGES))
+        self._scratch = c.Scratch(
+            jac_pos=np.zeros((3, model.nv)), jac_rot=np.zeros((3, model.nv)), factor=np.zeros((most, most)),
+            spread=np.zeros((most, 6)), inertia=np.zeros((6, 6)), block=np.zeros((3, 3)), tau=np.zeros(most),
+            pull=np.zeros(most), wrench=np.zeros(6), lost=np.zeros(6), speed=np.zeros(6),
+            goal_pos=np.zeros(3), goal_mat=np.zeros((3, 3)),
+        )  # fmt: skip
         self._substeps = int(env.control_timestep / env.model_timestep)
-        self._goal = np.empty(3), np.empty((3, 3))
-
-    @property
-    def _part(self) -> Any:
-        return self._robot.composite_controller.part_controllers["right"]
+        self.load()
 
     def step(self, action: Float[np.ndarray, "Da"]) -> None:
-        arm_size = self._part.control_dim
-        self._close(action[arm_size:])
-        memory = self._memory()
         at = 0
         while at < self._substeps:
-            at = self._control_step(self._physics, self._arm, memory, action, *self._goal, at, self._substeps)
+            at = self._control_step(
+                self._physics, self._arms, self._grippers, self._memory, self._scratch, action, at, self._substeps
+            )
             if at < self._substeps:
                 self._robosuite_substep()
                 at += 1
-        for part in self._robot.composite_controller.part_controllers.values():
-            part.new_update = True  # what the controllers remember of the state is of an earlier one
 
-    def _close(self, action: np.ndarray) -> None:
-        """The gripper's controls, as robosuite's grip controller computes them once a control step.
+    def load(self) -> None:
+        m = self._memory
+        for a, (robot, arm) in enumerate(arms_of(self._env)):
+            part, gripper = robot.composite_controller.part_controllers[arm], robot.gripper[arm]
+            n = self._arms.joints[a]
+            m.stale[a] = not part.new_update
+            m.joint_pos[a, :n], m.joint_vel[a, :n] = part.joint_pos, part.joint_vel
+            m.mass[a, :n, :n] = part.mass_matrix
+            if part.name in OSC_NAMES:
+                m.rest[a, :n] = part.initial_joint
+                m.position[a], m.rotation[a] = part.ref_pos, part.ref_ori_mat
+                m.velocity[a] = *part.ref_pos_vel, *part.ref_ori_vel
+                m.jacobian[a, :n] = part.J_full.T
+            if part.name == "JOINT_VELOCITY":
+                m.last_error[a, :n], m.error_sum[a, :n] = part.last_err, part.summed_err
+                m.changes[a, :, :n], m.newest[a], m.filled[a] = (
+                    part.derr_buf.buf,
+                    part.derr_buf.ptr,
+                    part.derr_buf._size,
+                )
+                m.saturated[a] = part.saturated
+            self._grippers.position[a, : self._fingers[a]] = gripper.current_action if gripper.dof else 0.0
 
-        It maps the gripper's own action, -1 to 1 for each finger, linearly onto the actuators' range.
-        """
-        fingers = self._robot.gripper["right"].format_action(action)
-        goal = np.minimum(np.maximum(fingers, -1.0), 1.0)
-        self._physics.ctrl[self._gripper_actuators] = self._gripper_middle + self._gripper_reach * goal
-
-    def _memory(self) -> Any:
-        """The controller's memory as the compiled function wants it.
-
-        Copies: the function writes the present state over them, and robosuite's arrays share memory with each
-        other (the null space's target with the joint positions, for one).
-        """
-        part = self._part
-        return self._memory_class(
-            stale=not part.new_update,
-            rest=np.array(part.initial_joint),
-            joint_pos=np.array(part.joint_pos),
-            joint_vel=np.array(part.joint_vel),
-            position=np.array(part.ref_pos),
-            rotation=np.array(part.ref_ori_mat),
-            velocity=np.array(part.ref_pos_vel),
-            spin=np.array(part.ref_ori_vel),
-            jacobian=np.array(part.J_full),
-            mass=np.array(part.mass_matrix, order="C"),
-        )
+    def store(self) -> None:
+        m = self._memory
+        for a, (robot, arm) in enumerate(arms_of(self._env)):
+            part, gripper = robot.composite_controller.part_controllers[arm], robot.gripper[arm]
+            n = self._arms.joints[a]
+            if not m.stale[a]:
+                part.new_update = True
+            if part.name == "JOINT_VELOCITY":
+                part.last_err, part.summed_err = m.last_error[a, :n].copy(), m.error_sum[a, :n].copy()
+                part.derr_buf.buf = m.changes[a, :, :n].copy()
+                part.derr_buf.ptr, part.derr_buf._size = int(m.newest[a]), int(m.filled[a])
+                part.saturated = bool(m.saturated[a])
+            if gripper.dof:
+                gripper.current_action = self._grippers.position[a, : self._fingers[a]].copy()
 
     def _robosuite_substep(self) -> None:
-        """One substep by robosuite's controller, towards the goal of this control step."""
-        goal_pos, goal_mat = self._goal
-        part, base_mat = self._part, self._arm.base_mat
-        part.goal_pos, part.goal_ori = base_mat.T @ (goal_pos - self._arm.base_pos), base_mat.T @ goal_mat
-        part.new_update = True
-        low, high = self._arm.torque_low, self._arm.torque_high
-        self._physics.ctrl[self._arm.actuators] = np.clip(part.run_controller(), low, high)
+        """One substep by robosuite's controllers, towards the goals of this control step."""
+        self.store()
+        for a, (robot, arm) in enumerate(arms_of(self._env)):
+            part, m, n = robot.composite_controller.part_controllers[arm], self._memory, self._arms.joints[a]
+            part.new_update = True
+            if part.name in OSC_NAMES:
+                part.update_origin(*robot.composite_controller.get_controller_base_pose(arm))
+                part.goal_pos, part.goal_ori = m.goal_pos[a].copy(), m.goal_mat[a].copy()
+            else:
+                goal = {"JOINT_POSITION": "goal_qpos", "JOINT_VELOCITY": "goal_vel", "JOINT_TORQUE": "goal_torque"}
+                setattr(part, goal[part.name], m.goal[a, :n].copy())
+            low, high = self._arms.torque_low[a, :n], self._arms.torque_high[a, :n]
+            self._physics.ctrl[self._arms.actuators[a, :n]] = np.clip(part.run_controller(), low, high)
         model, data = self._env.sim.model._model, self._env.sim.data._data
         mujoco.mj_step2(model, data)
         mujoco.mj_step1(model, data)
+        self.load()
+
+
+def arms_of(env: Any) -> Iterator[tuple[Any, str]]:
+    """Every arm of an environment: robosuite's robot and the arm's name in it."""
+    for robot in env.robots:
+        for arm in robot.arms:
+            yield robot, arm
+
+
+def action_start(env: Any, robot: Any, part: str) -> int:
+    """Where the action of a robot's part begins in the environment's."""
+    before = sum(other.action_dim for other in env.robots[: env.robots.index(robot)])
+    return before + robot.composite_controller._action_split_indexes[part][0]
+
+
+def _arm(env: Any, robot: Any, arm: str, size: int) -> dict[str, Any]:
+    """One arm's row of `compiled_step.Arms`, its arrays padded with zeros to `size`."""
+    from lfd.worlds import compiled_step as c
+
+    part, model = robot.composite_controller.part_controllers[arm], env.sim.model._model
+    part.scale_action(np.zeros(part.control_dim))  # fills in its scale
+    actuators = np.array(robot._ref_actuators_indexes_dict[arm])
+    n, osc = len(part.qpos_index), part.name in OSC_NAMES
+    goal_low, goal_high = np.full(n, -np.inf), np.full(n, np.inf)
+    if not osc:
+        limits = {"JOINT_POSITION": "position", "JOINT_VELOCITY": "velocity", "JOINT_TORQUE": "torque"}[part.name]
+        found = getattr(part, f"{limits}_limits")
+        if found is not None:
+            goal_low[:], goal_high[:] = found
+    rows = {
+        "qpos": np.array(part.qpos_index),
+        "qvel": np.array(part.qvel_index),
+        "actuators": actuators,
+        "torque_low": model.actuator_ctrlrange[actuators, 0],
+        "torque_high": model.actuator_ctrlrange[actuators, 1],
+        "mass_at": _mass_addresses(model)[np.ix_(part.qvel_index, part.qvel_index)],
+        "kp": getattr(part, "kp", np.zeros(n)),
+        "kd": getattr(part, "kd", np.zeros(n)),
+        "ki": getattr(part, "ki", np.zeros(n)),
+        "input_low": part.input_min,
+        "input_high": part.input_max,
+        "scale": part.action_scale,
+        "input_middle": part.action_input_transform,
+        "output_middle": part.action_output_transform,
+        "goal_low": goal_low,
+        "goal_high": goal_high,
+    }
+    base = env.sim.model.site_name2id(f"{part.naming_prefix}{part.part_name}_center")
+    return {
+        **{name: _padded(np.asarray(row), size) for name, row in rows.items()},
+        "kind": c.OSC if osc else 1 + JOINT_NAMES.index(part.name),
+        "joints": n,
+        "site": env.sim.model.site_name2id(part.ref_name),
+        "action_at": action_start(env, robot, arm),
+        "width": part.control_dim,
+        "turns": part.name == "OSC_POSE",
+        "uncoupled": osc and bool(part.uncoupling),
+        "base_site": base,
+        "base_moves": model.body_weldid[model.site_bodyid[base]] != 0,
+    }
+
+
+def _gripper(env: Any, robot: Any, arm: str, size: int) -> dict[str, Any]:
+    """One gripper's row of `compiled_step.Grippers`, padded to `size` fingers; all padding without a gripper."""
+    actuators, step, middle, reach = np.full(size, -1), np.zeros(size), np.zeros(size), np.zeros(size)
+    gripper, model, at = robot.gripper[arm], env.sim.model._model, 0
+    if gripper.dof:
+        driven = robot._ref_actuators_indexes_dict[f"{arm}_gripper"]
+        low, high = model.actuator_ctrlrange[driven].T
+        n, at = len(driven), action_start(env, robot, f"{arm}_gripper")
+        actuators[:n], middle[:n], reach[:n] = driven, 0.5 * (high + low), 0.5 * (high - low)
+        step[:n] = _moved(gripper, np.zeros(n), 1.0)
+    return {
+        "action_at": at, "actuators": actuators, "step": step, "middle": middle, "reach": reach,
+        "position": np.zeros(size),
+    }  # fmt: skip
+
+
+def _moved(gripper: Any, position: np.ndarray, action: float) -> np.ndarray:
+    """Where robosuite moves a gripper from `position`."""
+    before = gripper.current_action
+    gripper.current_action = position.copy()
+    moved = np.array(gripper.format_action(np.full(gripper.dof, action)), dtype=float)
+    gripper.current_action = before
+    return moved
+
+
+def _moves_by_sign(gripper: Any, fingers: int) -> bool:
+    """Whether a gripper moves as `compiled_step.Grippers` says; robosuite's dexterous hands do not."""
+    if gripper.dof != 1:
+        return False
+    still = np.zeros(fingers)
+    step = _moved(gripper, still, 1.0)
+    if step.shape != still.shape:
+        return False
+    return all(
+        np.array_equal(_moved(gripper, at, action), np.clip(at + step * np.sign(action), -1.0, 1.0))
+        for at in (still, np.full(fingers, 0.95), np.full(fingers, -0.95))
+        for action in (-1.0, -0.3, 0.0, 0.3, 1.0)
+    )
+
+
+def _mass_addresses(model: Any) -> np.ndarray:
+    """Where each entry of the mass matrix, (nv, nv), stands in mjData.qM; -1 for those that are always zero."""
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, full, np.arange(1.0, model.nM + 1))
+    return full.astype(np.int64) - 1
+
+
+def _padded(row: np.ndarray, size: int) -> np.ndarray:
+    return np.pad(row, [(0, size - length) for length in row.shape])
+
+
+def _stack(kind: Any, rows: list[dict[str, Any]]) -> Any:
+    return kind(
+        **{name: np.ascontiguousarray(np.stack([np.asarray(row[name]) for row in rows])) for name in kind._fields}
+    )
+
+
+def _empty_memory(arms: int, n: int, changes: int) -> dict[str, np.ndarray]:
+    vectors = ("rest", "joint_pos", "joint_vel", "goal", "last_error", "error_sum")
+    return {
+        **{name: np.zeros((arms, n)) for name in vectors},
+        **{name: np.zeros((arms, 3)) for name in ("position", "goal_pos")},
+        **{name: np.zeros((arms, 3, 3)) for name in ("rotation", "goal_mat")},
+        **{name: np.zeros(arms, dtype=np.int64) for name in ("newest", "filled")},
+        **{name: np.zeros(arms, dtype=np.bool_) for name in ("stale", "saturated")},
+        "velocity": np.zeros((arms, 6)),
+        "jacobian": np.zeros((arms, n, 6)),
+        "mass": np.zeros((arms, n, n)),
+        "changes": np.zeros((arms, changes, n)),
+    }
 
 
 def uncovered(env: Any) -> str:
     """What of an environment the compiled step does not cover; empty when it covers everything."""
     if mujoco.__version__ != MUJOCO:
         return f"mujoco {mujoco.__version__}, only {MUJOCO}"
-    if len(env.robots) != 1 or list(env.robots[0].arms) != ["right"]:
-        return "more than one arm"
     if not env.lite_physics:
         return "lite_physics=False"
-    parts = env.robots[0].composite_controller.part_controllers
-    if set(parts) != {"right", "right_gripper"}:
-        return f"the parts {', '.join(parts)}"
-    part = parts["right"]
-    if part.name not in ("OSC_POSE", "OSC_POSITION"):
+    for robot in env.robots:
+        controller = robot.composite_controller
+        if controller.name != "BASIC":
+            return f"the composite controller {controller.name}"
+        parts = controller.part_controllers
+        others = set(parts) - set(robot.arms) - {f"{arm}_gripper" for arm in robot.arms}
+        if others:
+            return f"the parts {', '.join(sorted(others))}"
+        for arm in robot.arms:
+            reason = _uncovered_arm(parts[arm])
+            if not reason and robot.gripper[arm].dof:
+                reason = _uncovered_gripper(parts[f"{arm}_gripper"], robot.gripper[arm])
+            if reason:
+                return reason
+    return ""
+
+
+def _uncovered_arm(part: Any) -> str:
+    if part.name not in OSC_NAMES + JOINT_NAMES:
         return f"the controller {part.name}"
-    if (part.impedance_mode, part.input_type, part.input_ref_frame) != ("fixed", "delta", "base"):
-        return f"impedance {part.impedance_mode}, input {part.input_type}, frame {part.input_ref_frame}"
-    if part.interpolator_pos is not None or part.interpolator_ori is not None:
+    if any(getattr(part, name, None) is not None for name in ("interpolator", "interpolator_pos", "interpolator_ori")):
         return "interpolators"
-    grip = parts["right_gripper"]
+    as_it_is = {"impedance_mode": "fixed", "input_type": "delta", "input_ref_frame": "base"}
+    for name, wanted in as_it_is.items():
+        if getattr(part, name, wanted) != wanted:
+            return f"{name} {getattr(part, name)}"
+    if part.name in OSC_NAMES and (part.position_limits is not None or part.orientation_limits is not None):
+        return "limits on the pose of the hand"
+    return ""
+
+
+def _uncovered_gripper(grip: Any, gripper: Any) -> str:
     plain = {grip.input_max.max(), grip.output_max.max()} == {1.0} == {-grip.input_min.min(), -grip.output_min.min()}
     simple = type(grip).__name__ == "SimpleGripController"
     if not (simple and grip.use_action_scaling and grip.interpolator is None and plain):
         return f"the gripper controller {type(grip).__name__} as it is configured"
+    if not _moves_by_sign(gripper, grip.control_dim):
+        return f"the gripper {type(gripper).__name__}"
     return ""
 
 

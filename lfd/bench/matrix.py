@@ -1,0 +1,89 @@
+"""Same numbers: the compiled step against robosuite's own, for robots x controllers x tasks."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lfd.core.protocols import Progress, silent
+from lfd.worlds.robosuite_world import make_world
+from lfd.worlds.robots import CONTROLLERS, robot_names
+from lfd.worlds.same_numbers import TOLERANCE, Comparison, compare
+from lfd.worlds.tasks import TASKS
+
+Case = tuple[str, str, str]
+"""Task, robot config and controller."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One case, compared."""
+
+    case: Case
+    found: Comparison
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matrix:
+    """What a run over many cases found."""
+
+    cases: int
+    control_steps: int
+    """Control steps compared in each case."""
+    within_tolerance: int
+    """Cases that differ from robosuite by at most 1e-9."""
+    within_robosuites_own: int
+    """Further cases that differ from robosuite no more than robosuite does from itself."""
+    beyond: list[str]
+    """Cases that differ more than that."""
+
+
+def whole_matrix() -> list[Case]:
+    """Every robot with every controller on every task."""
+    return [(task, robot, controller) for task in TASKS for robot in robot_names() for controller in CONTROLLERS]
+
+
+def quick_matrix() -> list[Case]:
+    """Cases in which every two of task, robot and controller meet."""
+    controllers = list(CONTROLLERS)
+    return [
+        (task, robot, controllers[(i + j) % len(controllers)])
+        for i, task in enumerate(TASKS)
+        for j, robot in enumerate(robot_names())
+    ]
+
+
+def compare_cases(cases: Sequence[Case], *, control_hz: int, steps: int, seed: int) -> Iterator[Row]:
+    """Compare each case over `steps` control steps of random actions from a start state drawn with `seed`."""
+    for task, robot, controller in cases:
+        world = make_world(task, robot, control_hz, "compiled", controller=controller)
+        rng = np.random.default_rng(seed)
+        world.reset(rng)
+        actions = rng.uniform(
+            1.2 * world.spec.action_low, 1.2 * world.spec.action_high, (steps, len(world.spec.action_low))
+        )
+        yield Row((task, robot, controller), compare(world, list(actions)))
+
+
+def bench_matrix(
+    cases: Sequence[Case], *, control_hz: int, steps: int, seed: int, progress: Progress = silent
+) -> Matrix:
+    """Compare all cases and count them."""
+    rows: list[Row] = []
+    with progress("same numbers", len(cases)) as bar:
+        for row in compare_cases(cases, control_hz=control_hz, steps=steps, seed=seed):
+            rows.append(row)
+            bar.advance(note=" ".join(row.case))
+    exact = [row for row in rows if row.found.ours <= TOLERANCE]
+    beyond = [
+        f"{' '.join(row.case)}: {row.found.ours:.1e}, robosuite itself {row.found.itself:.1e}"
+        for row in rows
+        if not row.found.is_same
+    ]
+    return Matrix(
+        cases=len(rows),
+        control_steps=steps,
+        within_tolerance=len(exact),
+        within_robosuites_own=len(rows) - len(exact) - len(beyond),
+        beyond=beyond,
+    )

@@ -1,0 +1,64 @@
+"""robosuite environments, built. The only module that imports robosuite."""
+
+import logging
+import warnings
+from functools import cache
+from typing import Any
+
+from lfd.worlds.robots import RobotConfig
+from lfd.worlds.tasks import Task
+
+HOLLOW_MESHES = {"Sawyer": ("_head_1", "_head_4"), "Baxter": ("_H1_1",)}
+"""Meshes too flat for the volume that MuJoCo >= 3.3 asks for; it computes their inertia as shells instead."""
+
+
+@cache
+def import_robosuite() -> Any:
+    """robosuite, without its messages about optional parts that lfd does not use."""
+    logging.getLogger("robosuite_logs").addFilter(lambda record: record.levelno >= logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SyntaxWarning)  # escape sequences in robosuite's docstrings
+        import robosuite
+        from robosuite.models import robots
+    for robot, meshes in HOLLOW_MESHES.items():
+        _make_hollow(getattr(robots, robot), meshes)
+    return robosuite
+
+
+def make_environment(task: Task, robot: RobotConfig, control_hz: int, **options: Any) -> Any:
+    """robosuite's own environment, without rendering; `options` go to `robosuite.make`.
+
+    A task for two arms gets two robots, or one that has two arms.
+    """
+    robosuite = import_robosuite()
+    from robosuite.controllers import load_composite_controller_config, load_part_controller_config
+    from robosuite.models.robots.robot_model import REGISTERED_ROBOTS
+
+    arms = REGISTERED_ROBOTS[robot.robosuite_name].arms
+    config: Any = load_composite_controller_config(controller="BASIC", robot=robot.robosuite_name)
+    parts = {arm: load_part_controller_config(default_controller=robot.controller) for arm in arms}
+    for arm, part in parts.items():
+        part |= {key: config["body_parts"][arm][key] for key in ("gripper", "input_type", "input_ref_frame")}
+    config["body_parts"] = parts
+    quiet = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False}
+    return robosuite.make(
+        task.name,
+        robots=[robot.robosuite_name] * (task.arms // len(arms) or 1),
+        controller_configs=config,
+        control_freq=control_hz,
+        ignore_done=True,
+        **(quiet | options),
+    )
+
+
+def _make_hollow(robot: Any, meshes: tuple[str, ...]) -> None:
+    """Let a robosuite robot model compute the inertia of some meshes as shells."""
+    build = robot.__init__
+
+    def build_hollow(self: Any, *args: Any, **kwargs: Any) -> None:
+        build(self, *args, **kwargs)
+        for mesh in self.asset.iter("mesh"):
+            if mesh.get("name", "").endswith(meshes):
+                mesh.set("inertia", "shell")
+
+    robot.__init__ = build_hollow
