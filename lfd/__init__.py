@@ -7,14 +7,19 @@ robosuite nor torch. Stages that share their name with a package (record, conver
 from importlib import import_module
 from typing import Any
 
+from lfd.worlds.gymnasium_ids import register_when_imported
+
 _PUBLIC = {
+    "ArmEnv": "lfd.worlds.gymnasium_env",
     "Decision": "lfd.core.protocols",
     "Episode": "lfd.core.episode",
     "InputError": "lfd.core.errors",
     "LfdError": "lfd.core.errors",
     "Observer": "lfd.core.protocols",
     "Policy": "lfd.core.protocols",
+    "VectorWorld": "lfd.worlds.vector_world",
     "World": "lfd.core.protocols",
+    "branch": "lfd.worlds.rollout",
     "channel": "lfd.core.channels",
     "episode_rng": "lfd.worlds.rollout",
     "evaluate": "lfd.run.evaluate",
@@ -23,10 +28,13 @@ _PUBLIC = {
     "make_world": "lfd.worlds.robosuite_world",
     "read_episode": "lfd.record.episode_file",
     "rollout": "lfd.worlds.rollout",
+    "rollouts": "lfd.worlds.rollout",
     "verify": "lfd.convert.to_lerobot",
     "verify_replay": "lfd.replay.verify",
     "wilson_interval": "lfd.run.wilson",
 }
+
+register_when_imported()
 
 __all__ = sorted(_PUBLIC)  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -95,7 +95,14 @@ def _record(given: argparse.Namespace) -> Result:
     tables = load_toml(given.recipe, ("record", "convert"), given.set)
     _put(tables, "record", episodes=given.episodes, seed=given.seed)
     recipe = build(RecordRecipe, tables.get("record", {}), f"{given.recipe} [record]")
-    done = record(recipe, given.out, tables=tables, overwrite=given.overwrite, progress=progress_bar)
+    done = record(
+        recipe,
+        given.out,
+        tables=tables,
+        most_worlds=given.worlds,
+        overwrite=given.overwrite,
+        progress=progress_bar,
+    )
     return {"out": str(given.out), **asdict(done)}
 
 
@@ -144,7 +151,16 @@ def _eval(given: argparse.Namespace) -> Result:
     tables = about_policy(given.policy)["recipe"]
     _put(tables, "eval", episodes=given.episodes, seed=given.seed)
     recipe = build(EvalRecipe, tables["eval"], f"{given.policy} [eval]")
-    report = asdict(evaluate(given.policy, recipe, given.out, overwrite=given.overwrite, progress=progress_bar))
+    report = asdict(
+        evaluate(
+            given.policy,
+            recipe,
+            given.out,
+            most_worlds=given.worlds,
+            overwrite=given.overwrite,
+            progress=progress_bar,
+        )
+    )
     del report["per_episode"]
     return {"out": str(given.out), **report}
 
@@ -207,6 +223,12 @@ def _bench(given: argparse.Namespace) -> Result:
     return asdict(measured)
 
 
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 1")
+    return int(text)
+
+
 def _put(tables: dict[str, dict[str, Any]], table: str, **values: Any) -> None:
     """Put the options that were given over the recipe's keys."""
     tables.setdefault(table, {}).update({key: value for key, value in values.items() if value is not None})
@@ -243,6 +265,12 @@ def _parser() -> argparse.ArgumentParser:
             help="override any key of the recipe; `lfd info RECIPE` lists them; may be repeated",
         )  # fmt: skip
 
+    def parallel(made: Any) -> None:
+        made.add_argument(
+            "--worlds", type=_count, default=2**16, metavar="N",
+            help="worlds to run in parallel at the most; the result is the same (default: one a core)",
+        )  # fmt: skip
+
     made = command(
         "record",
         _record,
@@ -252,6 +280,7 @@ def _parser() -> argparse.ArgumentParser:
     made.add_argument("recipe", type=Path, metavar="RECIPE", help="dataset recipe, a TOML file with a [record] table")
     made.add_argument("--episodes", type=int, metavar="N", help="successful demonstrations to record")
     made.add_argument("--seed", type=int, metavar="S", help="seed of start states and noise")
+    parallel(made)
     output(made, "the recordings")
     overrides(made)
 
@@ -290,6 +319,7 @@ def _parser() -> argparse.ArgumentParser:
     made.add_argument("policy", type=Path, metavar="POLICY", help="policy folder made by `lfd train`")
     made.add_argument("--episodes", type=int, metavar="N", help="start states to try")
     made.add_argument("--seed", type=int, metavar="S", help="seed of the start states")
+    parallel(made)
     output(made, "the report and the recordings of all episodes")
 
     made = command(

@@ -1,3 +1,4 @@
+import pickle
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -70,3 +71,10 @@ def test_a_missing_recipe_lists_its_neighbours(tmp_path: Path) -> None:
     write(tmp_path, "")
     with pytest.raises(RecipeError, match="no recipe .*lift.toml; in .*: recipe.toml"):
         load_toml(tmp_path / "lift.toml", ["train"])
+
+
+def test_an_unknown_name_survives_the_way_from_another_process() -> None:
+    error = UnknownName("task", "Lif", ["Lift"], "Look here.")
+    again = pickle.loads(pickle.dumps(error))
+    assert type(again) is UnknownName
+    assert str(again) == str(error)

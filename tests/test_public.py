@@ -6,9 +6,9 @@ import pytest
 import lfd
 
 PUBLIC = [
-    "Decision", "Episode", "InputError", "LfdError", "Observer", "Policy", "World", "channel", "episode_rng",
-    "evaluate", "load_frames", "make_expert", "make_world", "read_episode", "rollout", "verify", "verify_replay",
-    "wilson_interval",
+    "ArmEnv", "Decision", "Episode", "InputError", "LfdError", "Observer", "Policy", "VectorWorld", "World", "branch",
+    "channel", "episode_rng", "evaluate", "load_frames", "make_expert", "make_world", "read_episode", "rollout",
+    "rollouts", "verify", "verify_replay", "wilson_interval",
 ]  # fmt: skip
 
 
@@ -19,7 +19,7 @@ def test_the_public_surface_is_pinned() -> None:
 
 
 def test_unknown_names_list_the_known() -> None:
-    with pytest.raises(AttributeError, match="has no attribute 'rolout'; it has Decision, .*rollout"):
+    with pytest.raises(AttributeError, match="has no attribute 'rolout'; it has ArmEnv, Decision, .*rollout"):
         lfd.rolout  # noqa: B018
 
 

@@ -38,3 +38,33 @@ def test_decisions_of_a_policy_are_recorded_as_its_actions(thread, lift_world) -
     decision = policy.act({name: values[4] for name, values in episode.observations.items()})
     assert isinstance(decision, Decision)
     np.testing.assert_allclose(decision.action, episode.actions[4], atol=1e-6)
+
+
+def test_the_result_does_not_depend_on_the_number_of_worlds(thread, tmp_path, monkeypatch) -> None:
+    from lfd import evaluate
+    from lfd.run.evaluate import EvalRecipe
+    from lfd.worlds import robosuite_world
+
+    monkeypatch.setattr(robosuite_world, "_cores", lambda: 3)
+    recipe = EvalRecipe(episodes=4, seed=1, max_seconds=1.0, hold_seconds=0.5)
+    reports, states = [], []
+    for most in (1, 3):
+        out = tmp_path / str(most)
+        reports.append(evaluate(thread.policy, recipe, out, most_worlds=most))
+        states.append([read_episode(path).sim_states for path in recordings_in([out])])
+    assert reports[0].per_episode == reports[1].per_episode
+    for alone, together in zip(*states, strict=True):
+        np.testing.assert_array_equal(alone, together)
+
+
+def test_a_policy_decides_the_same_alone_and_among_others(thread, lift_world, rng) -> None:
+    from lfd.policies.acting import LearnedPolicy
+
+    policy = LearnedPolicy(thread.policy, lift_world.spec)
+    seen = []
+    for _ in range(11):
+        lift_world.reset(rng)
+        seen.append(lift_world.step(rng.uniform(-1, 1, 7)).observation)
+    together = policy.act_many(seen)
+    for observation, decision in zip(seen, together, strict=True):
+        np.testing.assert_array_equal(policy.act(observation).action, decision.action)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from lfd.core.protocols import Decision, StepResult, WorldState
-from lfd.worlds.rollout import Outcome, rollout
+from lfd.worlds.rollout import OneEach, Outcome, Start, branch, rollout, rollouts
 
 
 class Line:
@@ -111,3 +111,72 @@ def test_an_episode_can_begin_anywhere() -> None:
         start=start,
     )
     assert outcome.steps == 1
+
+
+class Shy:
+    """Moves by a random amount; asked in one go for all worlds."""
+
+    name = "shy"
+
+    def __init__(self):
+        self.asked, self.rngs = [], {}
+
+    def reset(self, place, rng):
+        self.rngs[place] = rng
+
+    def act(self, places, observations):
+        self.asked.append(tuple(places))
+        assert len(places) == len(observations)
+        return [Decision(self.rngs[place].uniform(0, 0.5, 1)) for place in places]
+
+
+def run_many(n: int) -> tuple[dict[int, Outcome], Shy]:
+    policy = Shy()
+    starts = iter([Start(index=i, rng=np.random.default_rng(i)) for i in range(10)])
+    worlds = [Line() for _ in range(n)]
+    ended = rollouts(worlds, policy, lambda: next(starts, None), horizon=20, hold_steps=1)
+    return {start.index: outcome for start, outcome in ended}, policy
+
+
+def test_outcomes_do_not_depend_on_the_number_of_worlds() -> None:
+    alone, _ = run_many(1)
+    assert sorted(alone) == list(range(10))
+    assert len(set(alone.values())) > 1
+    for n in (2, 7, 20):
+        together, policy = run_many(n)
+        assert together == alone
+        assert len(policy.asked[0]) == min(n, 10)  # once for all
+
+
+def test_branches_from_one_state_differ_by_their_generators_alone() -> None:
+    state = WorldState(model_xml="", sim=np.array([0.5]), memory={})
+    outcomes = [
+        branch(
+            [Line() for _ in range(n)],
+            state,
+            Shy(),
+            list(map(np.random.default_rng, [3, 4, 3])),
+            horizon=9,
+            hold_steps=1,
+        )
+        for n in (1, 2)
+    ]
+    assert outcomes[0] == outcomes[1]
+    first, second, again = outcomes[0]
+    assert first == again != second
+
+
+def test_an_error_in_one_world_breaks_all_episodes_off() -> None:
+    logs = [Log(), Log()]
+    starts = iter([Start(index=i, rng=np.random.default_rng(0), observers=[log]) for i, log in enumerate(logs)])
+    with pytest.raises(KeyboardInterrupt):
+        list(
+            rollouts(
+                [Line(), Line()],
+                OneEach([Push(-0.1), Push(0.01)]),
+                lambda: next(starts, None),
+                horizon=10,
+                hold_steps=1,
+            )
+        )
+    assert [log.events[-1] for log in logs] == ["abort", "abort"]

@@ -6,6 +6,7 @@ expected and what to type next. Any other `LfdError` is a failure of the run its
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import Any
 
 
 class LfdError(Exception):
@@ -33,10 +34,14 @@ class UnknownName(InputError):
 
     def __init__(self, kind: str, given: str, known: Iterable[str], hint: str = ""):
         names = sorted(known)
+        self._given = kind, given, names, hint
         close = get_close_matches(given, names, n=1)
         guess = f" Did you mean {close[0]!r}?" if close else ""
         tail = f" {hint}" if hint else ""
         super().__init__(f"unknown {kind} {given!r}; known: {', '.join(names)}.{guess}{tail}")
+
+    def __reduce__(self) -> Any:  # errors come back from other processes
+        return type(self), self._given
 
 
 class RecipeError(InputError):

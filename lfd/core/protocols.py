@@ -1,6 +1,6 @@
 """What everything that acts, is acted on, watches and reports progress has to offer."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -106,6 +106,21 @@ class Policy(Protocol):
         ...
 
     def act(self, observation: Observation) -> Decision: ...
+
+
+@runtime_checkable
+class BatchPolicy(Protocol):
+    """A policy that acts in many worlds and is asked once for all of them."""
+
+    name: str
+
+    def reset(self, place: int, rng: np.random.Generator) -> None:
+        """Begin an episode in the world number `place`."""
+        ...
+
+    def act(self, places: Sequence[int], observations: Sequence[Observation]) -> Sequence[Decision]:
+        """A decision for each of some worlds. It depends on what that world shows, not on the others."""
+        ...
 
 
 @dataclass(frozen=True)

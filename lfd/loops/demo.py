@@ -70,8 +70,8 @@ def demo(
         "training": asdict(trained),
         "replay_deviation": verified.deviation,
         "control_steps_per_second": {
-            "record": round(recorded.steps / seconds["record"], 1),
-            "eval": round(report.mean_steps * report.episodes / seconds["eval"], 1),
+            "record": recorded.steps_per_second,
+            "eval": report.steps_per_second,
         },
         "seconds": seconds,
     }

@@ -2,6 +2,7 @@
 
 import io
 import os
+from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from lfd.core.errors import PolicyError
 from lfd.core.protocols import Decision, Observation, WorldSpec
 
 WEIGHTS = "model.safetensors"
+ROWS = 8
+"""Observations that a network is asked for at a time, filled up with copies: matrix products of another size may
+round differently, and what a policy does must not depend on how many worlds there are."""
 
 
 class LearnedPolicy:
@@ -39,12 +43,34 @@ class LearnedPolicy:
         self._policy.reset()
 
     def act(self, observation: Observation) -> Decision:
-        batch = {
-            feature: torch.tensor([observation[name][i] for name, i in sources], dtype=torch.float32)
-            for feature, sources in self._sources.items()
-        }
-        action = self._after(self._policy.select_action(self._before(batch)))
-        return Decision(action.squeeze(0).numpy().astype(np.float64))
+        return self.act_many([observation])[0]
+
+    def act_many(self, observations: Sequence[Observation]) -> list[Decision]:
+        """Decisions for several observations; each is what `act` gives for it alone, bit for bit."""
+        decisions = []
+        for begin in range(0, len(observations), ROWS):
+            some = list(observations[begin : begin + ROWS])
+            filled = some + some[:1] * (ROWS - len(some))
+            batch = {
+                feature: torch.tensor([[seen[name][i] for name, i in sources] for seen in filled], dtype=torch.float32)
+                for feature, sources in self._sources.items()
+            }
+            actions = self._after(self._policy.select_action(self._before(batch))).numpy().astype(np.float64)
+            decisions += [Decision(action) for action in actions[: len(some)]]
+        return decisions
+
+
+class AskedOnce:
+    """A learned policy for many worlds, asked once for all of them."""
+
+    def __init__(self, policy: LearnedPolicy):
+        self._policy, self.name = policy, policy.name
+
+    def reset(self, place: int, rng: np.random.Generator) -> None:
+        self._policy.reset(rng)
+
+    def act(self, places: Sequence[int], observations: Sequence[Observation]) -> Sequence[Decision]:
+        return self._policy.act_many(observations)
 
 
 def load_policy(folder: Path) -> tuple[Any, Any, Any]:

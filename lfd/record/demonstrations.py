@@ -1,5 +1,6 @@
 """The record stage: demonstrations of a task, as many as the recipe asks for, one file each."""
 
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,14 +8,14 @@ from typing import Any
 
 from lfd.core.artifact import check_output, write_manifest
 from lfd.core.errors import LfdError, RecipeError
-from lfd.core.protocols import Policy, Progress, silent
+from lfd.core.protocols import Policy, Progress, World, silent
 from lfd.core.recipe import as_table
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.registry import make_expert
 from lfd.record.episode_file import McapRecorder, Origin
 from lfd.record.mcap_file import SUFFIX
-from lfd.worlds.robosuite_world import make_world
-from lfd.worlds.rollout import episode_rng, rollout
+from lfd.worlds.robosuite_world import EVERY_CORE, make_worlds
+from lfd.worlds.rollout import OneEach, Outcome, Start, episode_rng, rollouts
 
 STAGE = "record"
 
@@ -59,6 +60,11 @@ class Recorded:
     episodes: int
     failures: int
     steps: int
+    """Control steps of all attempts."""
+    clipped_steps: int
+    """Control steps whose action was beyond the controller's limits, and clipped."""
+    steps_per_second: float
+    """Control steps in a second of wall time, of all worlds together."""
 
 
 def record(
@@ -66,46 +72,83 @@ def record(
     out: Path,
     *,
     tables: Mapping[str, Any],
+    most_worlds: int = EVERY_CORE,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Recorded:
     """Record `recipe.episodes` successful demonstrations into the folder `out`.
 
     `tables` is the whole recipe file; each recording keeps it, so that `convert` knows what to do with it.
-    Failed attempts are counted and not kept. Episodes that are finished stay whatever happens to the rest.
+    Worlds run in parallel, one a core, `most_worlds` at the most; what is recorded does not depend on how many.
+    Failed attempts are counted and not kept; a recording has the number of its attempt. Episodes that are finished
+    stay whatever happens to the rest.
 
     Raises `OutputError` when `out` holds something already, `LfdError` when too many attempts fail.
     """
     check_output(out, overwrite=overwrite)
-    with progress("build world", 1) as bar:  # the first time on a machine, the control step is compiled
-        world = make_world(recipe.task, recipe.robot, recipe.control_hz)
-        bar.advance()
-    policy: Policy = make_expert(world.spec)
-    if recipe.action_noise > 0:
-        policy = NoisyPolicy(policy, scale=recipe.action_noise)
+    most = min(most_worlds, recipe.episodes)
+    worlds = make_worlds(recipe.task, recipe.robot, recipe.control_hz, most=most, progress=progress)
+    policies = [_demonstrator(world, recipe) for world in worlds]
     out.mkdir(parents=True, exist_ok=True)
     for old in (*out.glob(f"*{SUFFIX}"), *out.glob(f"*{SUFFIX}.part")):
         old.unlink()
     used = {**tables, "record": as_table(recipe)}
     write_manifest(out, kind="recordings", recipe=used, parents={}, seed=recipe.seed)
-    kept = steps = attempt = 0
+    began, tally = time.perf_counter(), _Tally(recipe.episodes, recipe.attempts_per_episode * recipe.episodes)
+
+    def next_start() -> Start | None:
+        attempt = tally.next_attempt()
+        if attempt is None:
+            return None
+        origin = Origin(stage=STAGE, policy=policies[0].name, seed=recipe.seed, index=attempt, recipe=used)
+        recorder = McapRecorder(out / f"episode_{attempt:06d}{SUFFIX}", origin, keep_failures=False)
+        return Start(index=attempt, rng=episode_rng(STAGE, recipe.seed, attempt), observers=[recorder])
+
+    ended = rollouts(
+        worlds,
+        OneEach(policies),
+        next_start,
+        horizon=round(recipe.max_seconds * recipe.control_hz),
+        hold_steps=max(1, round(recipe.hold_seconds * recipe.control_hz)),
+    )
     with progress(f"record {recipe.task}", recipe.episodes) as bar:
-        while kept < recipe.episodes:
-            if attempt >= recipe.attempts_per_episode * recipe.episodes:
-                raise LfdError(f"{attempt - kept} of {attempt} attempts failed; {kept} demonstrations are in {out}")
-            origin = Origin(stage=STAGE, policy=policy.name, seed=recipe.seed, index=attempt, recipe=used)
-            recorder = McapRecorder(out / f"episode_{kept:06d}{SUFFIX}", origin, keep_failures=False)
-            outcome = rollout(
-                world,
-                policy,
-                [recorder],
-                episode_rng(STAGE, recipe.seed, attempt),
-                horizon=round(recipe.max_seconds * recipe.control_hz),
-                hold_steps=max(1, round(recipe.hold_seconds * recipe.control_hz)),
-            )
-            attempt += 1
-            steps += outcome.steps
-            if outcome.success:
-                kept += 1
-                bar.advance(note=f"{attempt - kept} failed")
-    return Recorded(episodes=kept, failures=attempt - kept, steps=steps)
+        for _, outcome in ended:
+            tally.end(outcome)
+            rate = tally.steps / (time.perf_counter() - began)
+            bar.advance(int(outcome.success), note=f"{tally.failed} failed, {rate:.0f} steps/s")
+    if tally.kept < recipe.episodes:
+        raise LfdError(f"{tally.failed} of {tally.attempts} attempts failed; {tally.kept} demonstrations are in {out}")
+    rate = tally.steps / (time.perf_counter() - began)
+    return Recorded(tally.kept, tally.failed, tally.steps, tally.clipped, round(rate, 1))
+
+
+@dataclass
+class _Tally:
+    """Counts attempts, and says when another one is needed.
+
+    One is, when those that run would not be enough even if all of them succeed. Which attempts are made does
+    therefore not depend on how many run at a time.
+    """
+
+    wanted: int
+    most: int
+    attempts: int = 0
+    kept: int = 0
+    failed: int = 0
+    steps: int = 0
+    clipped: int = 0
+
+    def next_attempt(self) -> int | None:
+        if self.attempts - self.failed >= self.wanted or self.attempts >= self.most:
+            return None
+        self.attempts += 1
+        return self.attempts - 1
+
+    def end(self, outcome: Outcome) -> None:
+        self.steps, self.clipped = self.steps + outcome.steps, self.clipped + outcome.clipped
+        self.kept, self.failed = self.kept + outcome.success, self.failed + (not outcome.success)
+
+
+def _demonstrator(world: World, recipe: RecordRecipe) -> Policy:
+    expert = make_expert(world.spec)
+    return NoisyPolicy(expert, scale=recipe.action_noise) if recipe.action_noise > 0 else expert

@@ -32,6 +32,8 @@ class Sight:
     """Channel to the names of its components, in the order of the array."""
     slices: Mapping[str, slice]
     """Channel to its place in the array."""
+    size: int
+    """Length of the array."""
     prefixes: tuple[str, ...]
     """What the names of each arm's channels begin with: nothing for a single arm, else `robot1_` or `left_`."""
 
@@ -72,7 +74,7 @@ class Sight:
         for name in hands:
             self.labels[f"{name}_quat"], self.slices[f"{name}_quat"] = WXYZ, slice(at, at + 4)
             at += 4
-        self._seen = np.empty(at)
+        self.size, self._seen = at, np.empty(at)
         self._reads = [(source, index, self._seen[place]) for source, index, place in reads]
         self._turns = [
             (data.site_xmat[model.site(site).id], self._seen[self.slices[f"{name}_quat"]])

@@ -7,6 +7,7 @@ compiled where it can be (`lfd.worlds.steppers`).
 """
 
 import logging
+import os
 import random
 import threading
 import xml.etree.ElementTree as ET
@@ -19,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lfd.core.errors import InputError, SimulationError
-from lfd.core.protocols import Observation, StepResult, WorldSpec, WorldState
+from lfd.core.protocols import Observation, Progress, StepResult, WorldSpec, WorldState, silent
 from lfd.worlds.drawn_sizes import draw_sizes
 from lfd.worlds.environments import make_environment
 from lfd.worlds.observing import Sight
@@ -32,6 +33,8 @@ INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
 PLACED = ("body_pos", "body_quat")
 """Fields of the model that a reset changes: where robosuite places what cannot move, such as a door."""
+EVERY_CORE = 2**16
+"""As many worlds as there are cores."""
 logger = logging.getLogger(__name__)
 _GLOBAL_RANDOM = threading.Lock()  # robosuite 1.5.1 draws from the global generators of numpy and Python
 
@@ -68,6 +71,20 @@ class RobosuiteWorld:
     def step_backend(self) -> str:
         """What computes the control steps: compiled or robosuite."""
         return self._stepper.name
+
+    @property
+    def layout(self) -> Mapping[str, slice]:
+        """Channel to its place in the vector that `observe` gives."""
+        return self._sight.slices
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the vector that `observe` gives."""
+        return self._sight.size
+
+    def observe(self) -> Float[np.ndarray, "Do"]:
+        """The present observation as one vector."""
+        return self._sight.read().copy()
 
     def reset(self, rng: np.random.Generator) -> Observation:
         """Draw a start state as robosuite does: object sizes and poses, joint noise.
@@ -197,7 +214,7 @@ class RobosuiteWorld:
         return tuple(names)
 
     def _observe(self) -> Observation:
-        return self._sight.named(self._sight.read().copy())
+        return self._sight.named(self.observe())
 
     def _portable_xml(self) -> str:
         """The model as XML, mesh and texture paths starting with `robosuite/`, numbers in full."""
@@ -302,3 +319,21 @@ def make_world(
         config = replace(config, controller=controller)
         config.check(f"robot {robot}")
     return RobosuiteWorld(task=known, robot_name=robot, robot=config, control_hz=control_hz, stepper=stepper)
+
+
+def make_worlds(
+    task: str, robot: str, control_hz: int, *, most: int, progress: Progress = silent
+) -> list[RobosuiteWorld]:
+    """A world for each core of this machine, `most` at the most."""
+    count = max(1, min(most, _cores()))
+    worlds = []
+    with progress(f"build {count} {'world' if count == 1 else 'worlds'}", count) as bar:
+        for _ in range(count):  # the first time on a machine, the control step is compiled
+            worlds.append(make_world(task, robot, control_hz))
+            bar.advance()
+    return worlds
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -17,7 +17,7 @@ class Task:
     arms: int = 1
     """Arms that the task is for."""
     bodies: Mapping[str, str] = field(default_factory=dict)
-    """Objects beside the ones that robosuite places: name in the observation to body in the model."""
+    """Bodies to observe beside the roots of the objects, or in their place: name to body in the model."""
     points: Mapping[str, str] = field(default_factory=dict)
     """Points of objects: name in the observation to site in the model."""
 
@@ -39,7 +39,12 @@ TASKS: dict[str, Task] = {
         Task("PickPlaceBread", "put the bread into its bin"),
         Task("PickPlaceCereal", "put the cereal into its bin"),
         Task("PickPlaceCan", "put the can into its bin"),
-        Task("Door", "turn the handle and open the door", points={"handle": "Door_handle"}),
+        Task(
+            "Door",
+            "turn the handle and open the door",
+            bodies={"Door": "Door_door"},
+            points={"handle": "Door_handle"},
+        ),
         Task("Wipe", "wipe the dirt off the table"),
         Task("ToolHang", "put the hook into its stand and hang the tool on it"),
         Task(
