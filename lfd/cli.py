@@ -208,19 +208,31 @@ def _demo(given: argparse.Namespace) -> Result:
 
 
 def _bench(given: argparse.Namespace) -> Result:
-    from lfd.bench.sim import bench_sim
+    from lfd.bench.matrix import bench_matrix, whole_matrix
+    from lfd.bench.sim import bench_everywhere, bench_sim
     from lfd.loops.results import write_section
     from lfd.terminal import progress_bar
 
+    common: dict[str, Any] = {"control_hz": 20, "seed": given.seed, "progress": progress_bar}
     episodes = 2 if given.quick else 20
-    measured = bench_sim(
-        task=given.task, robot=given.robot, control_hz=20, episodes=episodes, seed=given.seed, progress=progress_bar
-    )
+    measured = asdict(bench_sim(task=given.task, robot=given.robot, episodes=episodes, **common))
+    sections = {
+        f"Simulation: {given.task} with {given.robot}": measured["ratios"]
+        | {f"steps/s, {name}": rate for name, rate in measured["steps_per_second"].items()}
+    }
+    if given.full:
+        measured["everywhere"] = bench_everywhere(**common)
+        measured["matrix"] = asdict(bench_matrix(whole_matrix(), steps=10, **common))
+        sections["Simulation: every task with a Panda, every robot on Lift"] = {
+            pair: ", ".join(f"{name} {value}" for name, value in ratios.items())
+            for pair, ratios in measured["everywhere"].items()
+        }
+        sections["Simulation: same numbers as robosuite, every robot x controller x task"] = measured["matrix"]
     if given.results is not None:
-        rows = measured.ratios | {f"steps/s, {name}": rate for name, rate in measured.steps_per_second.items()}
-        command = "lfd bench sim" + (" --quick" if given.quick else "")
-        write_section(given.results, f"Simulation: {given.task} with {given.robot}", command, rows)
-    return asdict(measured)
+        command = "lfd bench sim" + " --quick" * given.quick + " --full" * given.full
+        for title, rows in sections.items():
+            write_section(given.results, title, command, rows)
+    return measured
 
 
 def _count(text: str) -> int:
@@ -357,6 +369,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     made.add_argument("suite", choices=["sim"], help="what to measure")
     made.add_argument("--quick", action="store_true", help="a tenth of the steps")
+    made.add_argument(
+        "--full", action="store_true",
+        help="also every task, every robot, and the numbers of every robot x controller x task; takes ten minutes",
+    )  # fmt: skip
     made.add_argument(
         "--results", type=Path, metavar="PAGE.md", help="also write the table into a section of this page"
     )

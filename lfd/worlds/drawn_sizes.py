@@ -48,15 +48,20 @@ DRAWN: dict[str, Callable[[Any], tuple[Any, Any]]] = {
 """Task to its object and that object drawn anew from numpy's global generator, as loading the model does."""
 
 
-def draw_sizes(task: str, env: Any) -> None:
-    """Draw what robosuite draws while loading a task's model, into the model that is loaded."""
+def draw_sizes(task: str, env: Any, scratch: mujoco.MjData) -> None:
+    """Draw what robosuite draws while loading a task's model, into the model that is loaded.
+
+    `scratch` is an MjData of that model for intermediate results; it takes longer to make than to use.
+    """
     if task not in DRAWN:
         return
     present, drawn = DRAWN[task](env)
     element = drawn.get_obj()
     for geom in element.iter("geom"):
         geom.attrib.pop("material", None)  # its texture would be read from disk
-    _copy(_compiled_alone(env.model.root, element), env.sim.model._model)
+    model = env.sim.model._model
+    _copy(_compiled_alone(env.model.root, element), model)
+    mujoco.mj_setConst(model, scratch)  # masses of subtrees, inverse weights, statistics
     written = {(e.tag, e.get("name")): e for e in element.iter() if e.tag in ("geom", "site")}
     for e in env.model.root.iter():
         source = written.get((e.tag, e.get("name")))
@@ -97,4 +102,3 @@ def _copy(alone: Any, model: Any) -> None:
         nodes = alone.bvh_nodeid[theirs].copy()
         nodes[nodes >= 0] += model.body_geomadr[body] - alone.body_geomadr[at]
         model.bvh_nodeid[ours] = nodes
-    mujoco.mj_setConst(model, mujoco.MjData(model))  # masses of subtrees, inverse weights, statistics

@@ -42,6 +42,8 @@ _GLOBAL_RANDOM = threading.Lock()  # robosuite 1.5.1 draws from the global gener
 class RobosuiteWorld:
     """A task of robosuite with a robot; what it observes is described in `lfd.worlds.observing`.
 
+    A new world stands in the start state of seed 0.
+
     The action is the concatenation, arm by arm, of the controller's input in [-1, 1] and the gripper's (-1 open,
     1 close).
     """
@@ -66,6 +68,7 @@ class RobosuiteWorld:
             action_high=np.asarray(high, dtype=float),
             stepper=self._stepper.name,
         )
+        self.reset(np.random.default_rng(0))
 
     @property
     def step_backend(self) -> str:
@@ -99,7 +102,7 @@ class RobosuiteWorld:
             random.seed(seed)
             try:
                 if not self._is_guest:
-                    draw_sizes(self._task.name, self._env)
+                    draw_sizes(self._task.name, self._env, self._scratch)
                 self._env.reset()
             finally:
                 np.random.set_state(outside)
@@ -181,6 +184,7 @@ class RobosuiteWorld:
         self._model, self._data = sim.model._model, sim.data._data
         self._model_xml, self._is_guest = model_xml, model_xml is not None
         self._before = np.empty(mujoco.mj_stateSize(self._model, INTEGRATION))
+        self._scratch = mujoco.MjData(self._model)
         self._warnings, self._unstable = self._data.warning.number, [int(kind) for kind in UNSTABLE]
         self._compiled_places = {name: getattr(self._model, name).copy() for name in PLACED}
         self._sight = Sight(self._env, self._task)
