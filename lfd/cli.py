@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from lfd.core.errors import InputError, LfdError
+from lfd.worlds.rendering import check_wish
 
 Result = dict[str, Any]
 PIPELINE = """\
@@ -30,6 +31,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     command: Callable[[argparse.Namespace], Result] = arguments.command
     os.environ.setdefault("HF_HUB_OFFLINE", "1")
     try:
+        if command is not _doctor:
+            check_wish()
         with _only_json_on_stdout(arguments.json) as out:
             result = command(arguments)
             failed = result.pop("failed", False)
@@ -95,14 +98,16 @@ def _record(given: argparse.Namespace) -> Result:
     tables = load_toml(given.recipe, ("record", "convert"), given.set)
     _put(tables, "record", episodes=given.episodes, seed=given.seed)
     recipe = build(RecordRecipe, tables.get("record", {}), f"{given.recipe} [record]")
-    done = record(
-        recipe,
-        given.out,
-        tables=tables,
-        most_worlds=given.worlds,
-        overwrite=given.overwrite,
-        progress=progress_bar,
-    )
+    with _machines(given.cluster) as cluster:
+        done = record(
+            recipe,
+            given.out,
+            tables=tables,
+            most_worlds=given.worlds,
+            cluster=cluster,
+            overwrite=given.overwrite,
+            progress=progress_bar,
+        )
     return {"out": str(given.out), **asdict(done)}
 
 
@@ -151,16 +156,17 @@ def _eval(given: argparse.Namespace) -> Result:
     tables = about_policy(given.policy)["recipe"]
     _put(tables, "eval", episodes=given.episodes, seed=given.seed)
     recipe = build(EvalRecipe, tables["eval"], f"{given.policy} [eval]")
-    report = asdict(
-        evaluate(
+    with _machines(given.cluster) as cluster:
+        done = evaluate(
             given.policy,
             recipe,
             given.out,
             most_worlds=given.worlds,
+            cluster=cluster,
             overwrite=given.overwrite,
             progress=progress_bar,
         )
-    )
+    report = asdict(done)
     del report["per_episode"]
     return {"out": str(given.out), **report}
 
@@ -235,6 +241,19 @@ def _bench(given: argparse.Namespace) -> Result:
     return measured
 
 
+@contextmanager
+def _machines(address: str | None) -> Iterator[Any]:
+    """The cluster that was asked for, or none."""
+    if address is None:
+        yield None
+        return
+    from lfd.cluster import connect
+
+    with connect(address) as cluster:
+        print(f"{cluster.cpus} cores in the Ray cluster {address}", file=sys.stderr)
+        yield cluster
+
+
 def _count(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 1")
@@ -281,6 +300,11 @@ def _parser() -> argparse.ArgumentParser:
         made.add_argument(
             "--worlds", type=_count, default=2**16, metavar="N",
             help="worlds to run in parallel at the most; the result is the same (default: one a core)",
+        )  # fmt: skip
+        made.add_argument(
+            "--cluster", nargs="?", const="local", metavar="ADDRESS",
+            help="run on Ray, with the same result: `local` (also without an address) starts it on this machine, "
+            "`auto` joins the one that runs here, ray://HOST:10001 another; needs pip install 'lfd[cluster]'",
         )  # fmt: skip
 
     made = command(

@@ -197,3 +197,16 @@ def test_doctor_examines_this_machine() -> None:
     assert found["simulation"].startswith("ok")
     assert found["lerobot"] == "ok: 0.6.1"
     assert {"rendering egl", "gpu", "devices", "screen"} <= set(found)
+
+
+def test_a_renderer_that_is_not_installed_is_named(monkeypatch, capfd, tmp_path) -> None:
+    """`import mujoco` itself would crash."""
+    from ctypes.util import find_library
+
+    from lfd.cli import main
+
+    if find_library("OSMesa"):
+        pytest.skip("OSMesa is installed here")
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    assert main(["record", str(LIFT), "--out", str(tmp_path / "out")]) == 1
+    assert "OSMesa is not installed. On Debian or Ubuntu: `apt install libosmesa6`" in capfd.readouterr().err

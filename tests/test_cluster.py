@@ -193,3 +193,64 @@ def test_without_ray_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPa
 def test_importing_the_module_does_not_import_ray():
     code = "import sys, lfd.cluster; sys.exit('ray' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.slow
+def test_an_evaluation_that_loses_a_node_is_the_same_episode_for_episode(two_nodes: Any, thread: Any, tmp_path: Path):
+    from contextlib import nullcontext
+
+    from lfd import evaluate, read_episode
+    from lfd.run.evaluate import EvalRecipe
+
+    recipe = EvalRecipe(episodes=12, seed=5, max_seconds=2.0, hold_seconds=0.5)
+    (victim,) = two_nodes.worker_nodes
+    raylet = victim.all_processes["raylet"][0].process.pid
+
+    class KillsAtTheFirstEpisode:
+        killed = False
+
+        def advance(self, amount: int = 1, note: str = "") -> None:
+            if not self.killed:
+                self.killed = True
+                for process in [raylet, *descendants(raylet)]:
+                    os.kill(process, signal.SIGKILL)
+
+    alone = evaluate(thread.policy, recipe, tmp_path / "alone")
+    with connect(two_nodes.address) as cluster:
+        assert within(60, lambda: len({place for _, place in cluster(node, 0.3, range(6))}) == 2)
+        killer = KillsAtTheFirstEpisode()
+        together = evaluate(
+            thread.policy, recipe, tmp_path / "ray", cluster=cluster, progress=lambda label, total: nullcontext(killer)
+        )
+        assert killer.killed
+        assert cluster.repeated >= 1
+    assert together.per_episode == alone.per_episode
+    for index in range(12):
+        here, there = (
+            read_episode(tmp_path / place / "episodes" / f"episode_{index:06d}.mcap") for place in ("alone", "ray")
+        )
+        np.testing.assert_array_equal(here.sim_states, there.sim_states)
+
+
+@pytest.mark.slow
+def test_demonstrations_from_a_cluster_are_those_of_one_machine(tmp_path: Path):
+    from dataclasses import replace
+
+    from lfd import read_episode
+    from lfd.core.recipe import build, load_toml
+    from lfd.record.demonstrations import RecordRecipe, record
+
+    tables = load_toml(Path("datasets/lift_panda.toml"), ["record", "convert"])
+    recipe = replace(
+        build(RecordRecipe, tables["record"], "recipe"), episodes=3, max_seconds=1.9, attempts_per_episode=20
+    )
+    alone = record(recipe, tmp_path / "alone", tables=tables)
+    with connect("local") as cluster:
+        together = record(recipe, tmp_path / "ray", tables=tables, cluster=cluster)
+    assert (together.failures, together.steps) == (alone.failures, alone.steps)
+    assert alone.failures > 0  # so that a second round was needed
+    names = [path.name for path in sorted((tmp_path / "alone").glob("*.mcap"))]
+    assert names == [path.name for path in sorted((tmp_path / "ray").glob("*.mcap"))]
+    for name in names:
+        here, there = (read_episode(tmp_path / place / name) for place in ("alone", "ray"))
+        np.testing.assert_array_equal(here.sim_states, there.sim_states)

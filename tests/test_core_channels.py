@@ -32,4 +32,5 @@ def test_lerobot_keys_follow_its_rule_of_names() -> None:
     for row in CHANNELS.values():
         feature = row.feature or ""
         assert feature.startswith("action") == (feature == "action")
-        assert feature.startswith("observation") == (feature in ("observation.state", "observation.environment_state"))
+        inputs = ("observation.state", "observation.environment_state", "observation.images.{camera}")
+        assert feature.startswith("observation") == (feature in inputs)

@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfd.core.errors import LfdError
+from lfd.core.errors import LfdError, UnknownName
 from lfd.core.recipe import build, load_toml
 from lfd.record.demonstrations import RecordRecipe, record
 from lfd.record.episode_file import read_episode, recordings_in
@@ -40,3 +40,72 @@ def test_too_many_failures_end_the_recording_and_keep_the_successes(short, tmp_p
     hopeless = replace(short, max_seconds=0.5, attempts_per_episode=2)
     with pytest.raises(LfdError, match="6 of 6 attempts failed; 0 demonstrations are in"):
         record(hopeless, tmp_path / "out", tables={})
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory) -> Path:
+    """One demonstration with two cameras, and the dataset made of it."""
+    from lfd.convert.to_lerobot import convert
+
+    folder = tmp_path_factory.mktemp("filmed")
+    tables = load_toml(RECIPE, ["record", "convert"])
+    cameras = ["agentview", "robot0_eye_in_hand"]
+    tables["record"] |= {"episodes": 1, "cameras": cameras, "camera_height": 48, "camera_width": 64}
+    tables["convert"]["cameras"] = cameras
+    record(build(RecordRecipe, tables["record"], "recipe"), folder / "recordings", tables=tables)
+    convert([folder / "recordings"], folder / "dataset")  # verifies every pixel
+    return folder
+
+
+def test_pictures_show_the_recorded_states(filmed) -> None:
+    from lfd.record.png import decode_png
+    from lfd.worlds.cameras import Cameras
+
+    episode = read_episode(filmed / "recordings" / "episode_000000.mcap")
+    assert episode.sim_states is not None
+    assert list(episode.pictures) == ["agentview", "robot0_eye_in_hand"]
+    cameras = Cameras(episode.model_xml, list(episode.pictures), height=48, width=64)
+    for t in (0, len(episode) // 2, len(episode)):
+        for name, picture in cameras.render(episode.sim_states[t]).items():
+            np.testing.assert_array_equal(decode_png(episode.pictures[name][t]), picture)
+    cameras.close()
+
+
+def test_pictures_are_in_the_dataset_and_in_the_replay(filmed, tmp_path) -> None:
+    from lfd.convert.to_lerobot import lerobot_datasets
+    from lfd.record.png import decode_png
+    from lfd.replay.clip import clip_of
+    from lfd.replay.rerun_scene import replay
+
+    episode = read_episode(filmed / "recordings" / "episode_000000.mcap")
+    with lerobot_datasets() as dataset_class:
+        row = dataset_class("lfd/filmed", root=filmed / "dataset", video_backend="pyav")[7]
+    seen = (row["observation.images.agentview"].numpy().transpose(1, 2, 0) * 255).round().astype(np.uint8)
+    np.testing.assert_array_equal(seen, decode_png(episode.pictures["agentview"][7]))
+    bytes_saved = {}
+    for what in ("recordings", "dataset"):
+        replay(clip_of(filmed / what, 0), save=tmp_path / f"{what}.rrd")
+        bytes_saved[what] = (tmp_path / f"{what}.rrd").stat().st_size
+    pictures = sum(len(data) for one in episode.pictures.values() for data in one)
+    assert bytes_saved["recordings"] > bytes_saved["dataset"] + 0.9 * pictures
+
+
+def test_other_programs_read_the_pictures(filmed) -> None:
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    from lfd.record.png import decode_png
+
+    with (filmed / "recordings" / "episode_000000.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        _, _, _, message = next(reader.iter_decoded_messages(topics=["/cameras/agentview"]))
+    assert message.format == "png"
+    assert decode_png(bytes(message.data)).shape == (48, 64, 3)
+
+
+def test_a_camera_that_is_not_there_is_named_with_those_that_are(short, tmp_path) -> None:
+    with pytest.raises(
+        UnknownName, match="unknown camera 'agent'; known: agentview, birdview, .*Did you mean 'agentview'"
+    ):
+        record(replace(short, cameras=("agent",)), tmp_path / "out", tables={})
+    assert not (tmp_path / "out").exists()

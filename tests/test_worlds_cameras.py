@@ -201,3 +201,15 @@ def test_simplify_minimises_distances_to_planes(rng) -> None:
     inside = np.abs(moved[0] - points.mean(0)).max() < 0.5
     assert inside
     assert gradient == pytest.approx([0, 0, 0], abs=1e-8)
+
+
+def test_any_thread_may_draw(start) -> None:
+    """As the threads of parallel worlds do."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    cameras = Cameras(start.model_xml, ["agentview"], height=32, width=32)
+    here = cameras.render(start.sim)["agentview"]
+    with ThreadPoolExecutor(3) as pool:
+        for there in [pool.submit(cameras.render, start.sim).result() for _ in range(6)]:
+            np.testing.assert_array_equal(there["agentview"], here)
+    cameras.close()

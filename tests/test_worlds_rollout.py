@@ -16,6 +16,9 @@ class Line:
     def sim_state(self):
         return np.array([self.x])
 
+    def pictures(self):
+        return {}
+
     def get_state(self):
         return WorldState(model_xml="", sim=self.sim_state(), memory={})
 

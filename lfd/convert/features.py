@@ -13,6 +13,7 @@ import numpy as np
 from lfd.core.channels import CHANNELS, ENVIRONMENT_STATE, STATE, channel
 from lfd.core.episode import Episode
 from lfd.core.errors import DatasetError, RecipeError, UnknownName
+from lfd.record.png import decode_png
 
 FLAGS = ("reward", "success", "done", "intervention")
 
@@ -27,6 +28,8 @@ class ConvertRecipe:
     """Channels of the objects, in the order in which they make up observation.environment_state."""
     action: str
     """What becomes the action to imitate: `expert_action`, as the expert meant it, or `action`, as it was applied."""
+    cameras: tuple[str, ...] = ()
+    """Cameras whose pictures become observation.images.CAMERA, without loss."""
 
     def check(self, where: str) -> None:
         if self.action not in ("action", "expert_action"):
@@ -61,6 +64,11 @@ def features_of(episode: Episode, recipe: ConvertRecipe) -> dict[str, dict[str, 
     if recipe.environment_state:
         features[ENVIRONMENT_STATE] = vector(component_names(episode, recipe.environment_state))
     features["action"] = vector(list(episode.labels["action"]))
+    for name in recipe.cameras:
+        if name not in episode.pictures:
+            raise UnknownName("camera", name, episode.pictures, "A recipe's [record] cameras says what is recorded.")
+        shape = decode_png(episode.pictures[name][0]).shape
+        features[_picture(name)] = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
     for name in FLAGS:
         kind = "float32" if name == "reward" else "bool"
         features[_key(name)] = {"dtype": kind, "shape": (1,), "names": None}
@@ -82,10 +90,16 @@ def columns_of(episode: Episode, recipe: ConvertRecipe) -> Mapping[str, np.ndarr
     columns = {STATE: joined(recipe.state)}
     if recipe.environment_state:
         columns[ENVIRONMENT_STATE] = joined(recipe.environment_state)
+    for name in recipe.cameras:
+        columns[_picture(name)] = np.stack([decode_png(data) for data in episode.pictures[name][:-1]])
     columns["action"] = actions.astype(np.float32)
     done = np.arange(len(episode)) == len(episode) - 1
     flags = (episode.rewards.astype(np.float32), episode.successes, done, episode.interventions)
     return columns | {_key(name): values[:, None] for name, values in zip(FLAGS, flags, strict=True)}
+
+
+def _picture(camera: str) -> str:
+    return channel(f"{camera}_picture").feature or ""
 
 
 def _key(name: str) -> str:

@@ -140,3 +140,16 @@ def new_folder(path: Path, *, overwrite: bool) -> Iterator[Path]:
         raise OutputError(f"cannot write {path}: {error.strerror}; free space or choose another --out") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def packed(folder: Path) -> dict[str, bytes]:
+    """The files of a folder by their relative names, to be sent to another machine."""
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def unpack(files: Mapping[str, bytes], folder: Path) -> None:
+    """Write what `packed` gave into a folder."""
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)

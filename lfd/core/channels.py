@@ -12,6 +12,7 @@ from lfd.core.errors import UnknownName
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
 ARRAY = "std_msgs/msg/Float64MultiArray"
+IMAGE = "sensor_msgs/msg/CompressedImage"
 
 STATE = "observation.state"
 ENVIRONMENT_STATE = "observation.environment_state"
@@ -25,7 +26,8 @@ class Channel:
     """One row of the table."""
 
     name: str
-    """Key in an observation; `{object}` stands for the name of an object of the task, `{arm}` for one of two arms."""
+    """Key in an observation; `{object}` stands for the name of an object of the task, `{arm}` for one of two arms,
+    `{camera}` for a camera."""
     meaning: str
     """What the numbers are."""
     unit: str
@@ -44,7 +46,7 @@ class Channel:
     """Rerun entity of its plot."""
 
     def of(self, name: str) -> "Channel":
-        """This row with its blank, `{object}` or `{arm}`, filled in for the channel called `name`."""
+        """This row with its blank, such as `{object}`, filled in for the channel called `name`."""
         blank, _, suffix = self.name.rpartition("}")
         part = name.removesuffix(suffix)
         filled = {key: value.replace(f"{blank}}}", part) for key, value in vars(self).items() if value}
@@ -76,6 +78,7 @@ CHANNELS: dict[str, Channel] = {row.name: row for row in (
     _row("{object}_point", "position of a point of an object", "m", "world", "/objects/{object}/point", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/point"),
     _row("{object}_pos", "position of an object's body", "m", "world", "/objects/{object}/pose", POSE, "position", ENVIRONMENT_STATE, "plots/objects/{object}/position"),
     _row("{object}_quat", "orientation of an object's body, wxyz", "1", "world", "/objects/{object}/pose", POSE, "orientation", ENVIRONMENT_STATE, "plots/objects/{object}/orientation"),
+    _row("{camera}_picture", "what a camera sees, RGB", "1/255", "camera", "/cameras/{camera}", IMAGE, "data", "observation.images.{camera}", "cameras/{camera}"),
     _row("sim_state", "MuJoCo's mjSTATE_INTEGRATION", "mixed", "model", "/sim/state", ARRAY, "data", None, ""),
     _row("action", "action that was applied", "controller", "controller", "/action", ARRAY, "data", "action", "plots/action/applied"),
     _row("expert_action", "action that the expert proposed", "controller", "controller", "/expert/action", ARRAY, "data", "expert_action", "plots/action/expert"),

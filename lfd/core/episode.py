@@ -5,7 +5,7 @@ of `rewards` and `successes` was measured after it. Arrays are float64 and read-
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
@@ -71,6 +71,8 @@ class Episode:
     """What the expert proposed, where it was asked."""
     sim_states: Float[np.ndarray, "T1 _"] | None = None
     """MuJoCo's integration state at each observation."""
+    pictures: Mapping[str, tuple[bytes, ...]] = field(default_factory=dict)
+    """Camera to its picture at each observation, as PNG."""
     labels: Mapping[str, tuple[str, ...]]
     """Names of the components of each observation channel and of `action`."""
     metadata: EpisodeMetadata
@@ -102,6 +104,9 @@ class Episode:
             if not finite.all():
                 raise EpisodeError(f"channel {name!r} is not finite at step {int(np.argmin(finite))}")
             values.flags.writeable = False
+        for name, pictures in self.pictures.items():
+            if len(pictures) != steps + 1:
+                raise EpisodeError(f"camera {name!r} has {len(pictures)} pictures, {steps} actions need {steps + 1}")
         if not (np.diff(self.times) > 0).all():
             raise EpisodeError(f"time does not increase at step {int(np.argmin(np.diff(self.times) > 0)) + 1}")
         for name, names in self.labels.items():

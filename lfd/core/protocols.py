@@ -1,12 +1,12 @@
 """What everything that acts, is acted on, watches and reports progress has to offer."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 Observation = Mapping[str, Float[np.ndarray, "_"]]
 """Channel name to a vector, in the units and frames of `lfd.core.channels`."""
@@ -30,6 +30,8 @@ class WorldSpec:
     """Highest action that the controller takes; higher ones are clipped."""
     stepper: str
     """What computes a control step."""
+    cameras: tuple[str, ...] = ()
+    """Names of the cameras whose pictures the world takes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +76,10 @@ class World(Protocol):
 
     def sim_state(self) -> Float[np.ndarray, "_"]:
         """MuJoCo's mjSTATE_INTEGRATION now."""
+        ...
+
+    def pictures(self) -> Mapping[str, UInt8[np.ndarray, "H W 3"]]:
+        """What the world's cameras see now, RGB; none unless they were asked for."""
         ...
 
     def get_state(self) -> WorldState: ...
@@ -152,6 +158,22 @@ class Observer(Protocol):
 
 
 @runtime_checkable
+class UnitMap(Protocol):
+    """Runs a function over units of work on other machines (`lfd.cluster`)."""
+
+    @property
+    def cpus(self) -> int:
+        """Units that run at a time."""
+        ...
+
+    def __call__[Shared, Unit, Result](
+        self, function: Callable[[Shared, Unit], Result], shared: Shared, units: Sequence[Unit]
+    ) -> Iterator[tuple[int, Result]]:
+        """Results of `function(shared, unit)` as they finish, each with the index of its unit."""
+        ...
+
+
+@runtime_checkable
 class Bar(Protocol):
     """A running progress bar."""
 
@@ -174,3 +196,9 @@ def silent(label: str, total: int) -> AbstractContextManager[Bar]:
     """Progress that shows nothing."""
     del label, total
     return nullcontext(_Silence())
+
+
+def batches(count: int, cpus: int) -> list[range]:
+    """The numbers below `count` in units of work: some for each of `cpus`, so that all end at about the same time."""
+    size = max(1, count // (4 * max(cpus, 1)))
+    return [range(begin, min(begin + size, count)) for begin in range(0, count, size)]

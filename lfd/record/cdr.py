@@ -32,6 +32,7 @@ DEFINITIONS: dict[str, str] = {
     "sensor_msgs/msg/JointState": (
         "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort"
     ),
+    "sensor_msgs/msg/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data",
     "rcl_interfaces/msg/Log": (
         "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line"
     ),
@@ -79,6 +80,12 @@ class Packer:
             self._bytes += np.ascontiguousarray(values, dtype="<f8").tobytes()
         return self
 
+    def octets(self, values: bytes) -> "Packer":
+        """A sequence of uint8."""
+        self.pack("I", len(values))
+        self._bytes += values
+        return self
+
     def stamp(self, time_ns: int) -> "Packer":
         return self.pack("i", time_ns // 10**9).pack("I", time_ns % 10**9)
 
@@ -110,6 +117,10 @@ class Unpacker:
 
     def text(self) -> str:
         return bytes(self._take(self.unpack("I"), 1))[:-1].decode()
+
+    def octets(self) -> bytes:
+        """A sequence of uint8."""
+        return bytes(self._take(self.unpack("I"), 1))
 
     def doubles(self, count: int | None = None) -> np.ndarray:
         """A sequence of float64, or `count` single ones in a row."""
@@ -197,3 +208,17 @@ def pack_log(time_ns: int, text: str) -> bytes:
 def pack_string(text: str) -> bytes:
     """std_msgs/String."""
     return Packer().text(text).finish()
+
+
+def pack_image(time_ns: int, frame: str, data: bytes) -> bytes:
+    """sensor_msgs/CompressedImage of a PNG."""
+    return Packer().stamp(time_ns).text(frame).text("png").octets(data).finish()
+
+
+def unpack_image(data: bytes) -> bytes:
+    """sensor_msgs/CompressedImage: the compressed picture."""
+    message = Unpacker(data)
+    message.stamp()
+    message.text()
+    message.text()
+    return message.octets()

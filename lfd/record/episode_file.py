@@ -15,18 +15,20 @@ from typing import Any
 import numpy as np
 
 from lfd.core.artifact import versions
-from lfd.core.channels import ARRAY, CHANNELS, JOINT_STATE, POSE, channel
+from lfd.core.channels import ARRAY, CHANNELS, IMAGE, JOINT_STATE, POSE, channel
 from lfd.core.episode import Episode, EpisodeMetadata
 from lfd.core.errors import EpisodeError, RecordingError
 from lfd.core.protocols import Observation, Transition, World
 from lfd.core.rotations import wxyz_from_xyzw, xyzw_from_wxyz
 from lfd.record import cdr
 from lfd.record.mcap_file import DAMAGE, SUFFIX, McapContent, McapWriter, read_mcap
+from lfd.record.png import encode_png
 
 FORMAT = "1"
 STEP_LABELS = ("reward", "success", "done", "intervention")
 JOINT_KINDS = ("joint", "gripper")
 BEGIN, END = "lfd.episode", "lfd.episode_end"
+CAMERAS = CHANNELS["{camera}_picture"].topic.removesuffix("{camera}")
 MODEL, MEMORY = "model.xml", "controller_memory.json"
 
 
@@ -56,6 +58,7 @@ class McapRecorder:
         self._writer = McapWriter(self._path)
         self._labels, self._hz = spec.labels, spec.control_hz
         self._rows = {name: channel(name) for name in spec.labels if name != "action"}
+        self._topics = {name: channel(f"{name}_picture").topic for name in spec.cameras}
         names = spec.labels["action"]
         self._grip_at = [at for at, name in enumerate(names) if name.endswith("gripper")]
         self._grips = [names[at] for at in self._grip_at]
@@ -85,6 +88,7 @@ class McapRecorder:
         self._writer.message("/task", self._start_ns, cdr.pack_string(spec.instruction))
         self._event(self._start_ns, "episode_begin", policy=origin.policy, seed=origin.seed, index=origin.index)
         self._write_observation(self._start_ns, observation, state.sim)
+        self._write_pictures(self._start_ns, world)
         self._steps, self._reward, self._failure = 0, 0.0, ""
 
     def step(self, world: World, transition: Transition) -> None:
@@ -100,6 +104,7 @@ class McapRecorder:
         numbers = np.array([result.reward, result.success, transition.done, decision.intervention], dtype=float)
         self._writer.message("/step", then, cdr.pack_array(STEP_LABELS, numbers))
         self._write_observation(then, result.observation, world.sim_state())
+        self._write_pictures(then, world)
         self._steps, self._reward = transition.step + 1, self._reward + result.reward
         self._failure = result.failure
 
@@ -120,6 +125,8 @@ class McapRecorder:
     def _announce(self) -> None:
         for row in (*self._rows.values(), *(channel(name) for name in ("sim_state", "action", "expert_action"))):
             self._writer.channel(row.topic, row.schema, {"unit": row.unit, "frame": row.frame})
+        for name, topic in self._topics.items():
+            self._writer.channel(topic, IMAGE, {"unit": "1/255", "frame": name})
         self._writer.channel("/step", CHANNELS["reward"].schema, {"unit": "1", "frame": "task"})
         self._writer.channel("/gripper/command", CHANNELS["action"].schema, {"unit": "controller"})
         self._writer.channel("/tf", "tf2_msgs/msg/TFMessage", {"unit": "m", "frame": "world"})
@@ -149,6 +156,10 @@ class McapRecorder:
                 self._writer.message(row.topic, now, cdr.pack_array(self._labels[name], seen[name]))
         self._writer.message("/tf", now, cdr.pack_transforms(now, frames))
         self._writer.message("/sim/state", now, cdr.pack_array(("mjSTATE_INTEGRATION",), sim_state))
+
+    def _write_pictures(self, now: int, world: World) -> None:
+        for name, picture in world.pictures().items():
+            self._writer.message(self._topics[name], now, cdr.pack_image(now, name, encode_png(picture)))
 
 
 def read_episode(path: Path) -> Episode:
@@ -194,6 +205,11 @@ def _decode(content: McapContent, about: dict[str, str]) -> Episode:
         interventions=columns["intervention"] > 0.5,
         expert_actions=_array(content, expert)[1] if expert in content.messages else None,
         sim_states=_array(content, "/sim/state")[1],
+        pictures={
+            topic.removeprefix(CAMERAS): tuple(cdr.unpack_image(data) for _, data in messages)
+            for topic, messages in content.messages.items()
+            if topic.startswith(CAMERAS)
+        },
         labels=labels,
         metadata=EpisodeMetadata(**metadata),
         model_xml=content.attachments[MODEL].decode(),

@@ -1,8 +1,7 @@
 """What a replay shows, whatever it comes from: curves over time, and the motion of a model."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from importlib.util import find_spec
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
@@ -14,6 +13,7 @@ from lfd.core.episode import Episode
 from lfd.core.errors import DatasetError, InputError, UnknownName
 from lfd.data.frames import load_frames
 from lfd.record.episode_file import read_episode, recording_in
+from lfd.worlds.cameras import load_model
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,8 @@ class Clip:
     """Name to a path in the world frame [m]."""
     model: mujoco.MjModel | None
     qpos: Float[np.ndarray, "N nq"] | None
-
-
-def load_model(xml: str) -> mujoco.MjModel:
-    """A recorded model, its meshes taken from the installed robosuite."""
-    spec = find_spec("robosuite")
-    assert spec is not None
-    assert spec.submodule_search_locations
-    folder = Path(next(iter(spec.submodule_search_locations))).as_posix()
-    return mujoco.MjModel.from_xml_string(xml.replace('"robosuite/', f'"{folder}/'))
+    pictures: Mapping[str, tuple[bytes, ...]] = field(default_factory=dict)
+    """Rerun path to the PNG of each row."""
 
 
 def clip_of(source: Path, episode: int) -> Clip:
@@ -75,7 +68,8 @@ def _clip_of_episode(episode: Episode, title: str) -> Clip:
     model = load_model(episode.model_xml)
     assert episode.sim_states is not None
     qpos = episode.sim_states[:, 1 : 1 + model.nq]  # mjSTATE_INTEGRATION begins with time, qpos
-    return Clip(title, episode.times, curves, positions, model, qpos)
+    pictures = {channel(f"{name}_picture").path: data for name, data in episode.pictures.items()}
+    return Clip(title, episode.times, curves, positions, model, qpos, pictures)
 
 
 def _clip_of_dataset(root: Path, episode: int) -> Clip:

@@ -44,6 +44,7 @@ def replay(clip: Clip, *, save: Path | None, overwrite: bool = False) -> None:
         _log_motion(recording, clip.model, clip.qpos, clip.times)
     _log_paths(recording, clip)
     _log_curves(recording, clip)
+    _log_pictures(recording, clip)
     recording.flush()
     if save is not None and file is not None:
         _write(save, file.read() or b"")
@@ -79,6 +80,9 @@ def _blueprint(clip: Clip) -> rrb.Blueprint:
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=(1.05, -0.85, 1.45), look_target=(-0.15, 0.05, 0.9)),
     )
+    if clip.pictures:
+        pictures = [rrb.Spatial2DView(name=path.removeprefix("cameras/"), origin=path) for path in clip.pictures]
+        scene = rrb.Vertical(scene, rrb.Horizontal(*pictures), row_shares=[3, 2])
     return rrb.Blueprint(
         rrb.Horizontal(scene, rrb.Vertical(*map(view, first), rrb.Tabs(*map(view, others))), column_shares=[3, 2]),
         rrb.TimePanel(timeline="time", state="collapsed"),
@@ -192,6 +196,13 @@ def _log_curves(recording: rr.RecordingStream, clip: Clip) -> None:
     for path, curve in clip.curves.items():
         recording.log(path, rr.SeriesLines(names=list(curve.names)), static=True)
         recording.send_columns(path, indexes=_clock(clip.times), columns=rr.Scalars.columns(scalars=curve.values))
+
+
+def _log_pictures(recording: rr.RecordingStream, clip: Clip) -> None:
+    for path, pictures in clip.pictures.items():
+        recording.log(path, rr.EncodedImage.from_fields(media_type="image/png"), static=True)
+        columns = rr.EncodedImage.columns(blob=[np.frombuffer(data, np.uint8) for data in pictures])
+        recording.send_columns(path, indexes=_clock(clip.times), columns=columns)
 
 
 def _clock(times: np.ndarray) -> list[rr.TimeColumn]:

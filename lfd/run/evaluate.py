@@ -1,20 +1,22 @@
 """The eval stage: a policy's success over start states that no demonstration began at."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from lfd.core.artifact import new_folder, sha256, write_json, write_manifest
+from lfd.core.artifact import new_folder, packed, sha256, unpack, write_json, write_manifest
 from lfd.core.errors import RecipeError
-from lfd.core.protocols import Progress, silent
+from lfd.core.protocols import Progress, UnitMap, World, batches, silent
 from lfd.core.recipe import as_table
-from lfd.policies.acting import AskedOnce, LearnedPolicy, about_policy
+from lfd.policies.acting import AskedOnce, LearnedPolicy, about_policy, load_policy
 from lfd.record.episode_file import McapRecorder, Origin
 from lfd.record.mcap_file import SUFFIX
 from lfd.run.wilson import wilson_interval
-from lfd.worlds.robosuite_world import EVERY_CORE, make_worlds
+from lfd.worlds.robosuite_world import EVERY_CORE, kept_world, make_worlds
+from lfd.worlds.robots import RobotConfig, load_robot
 from lfd.worlds.rollout import Start, episode_rng, rollouts
 
 STAGE = "eval"
@@ -72,23 +74,39 @@ def evaluate(
     out: Path,
     *,
     most_worlds: int = EVERY_CORE,
+    cluster: UnitMap | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Report:
     """Run a policy from `recipe.episodes` start states; recordings and the report land in the folder `out`.
 
-    Worlds run in parallel, one a core, `most_worlds` at the most; the result does not depend on how many.
-    Raises `PolicyError` for a policy that cannot be loaded, `OutputError` when `out` exists.
+    Worlds run in parallel, one a core, `most_worlds` at the most, or on the machines of a `cluster`; the result
+    does not depend on where, nor on how many. Raises `PolicyError` for a policy that cannot be loaded,
+    `OutputError` when `out` exists.
     """
     about = about_policy(policy)
     used = {**about["recipe"], "eval": as_table(recipe)}
     began = time.perf_counter()
     with new_folder(out, overwrite=overwrite) as part:
         (part / "episodes").mkdir()
-        rows, stepping = run_episodes(
-            policy, recipe, range(recipe.episodes), part / "episodes", most_worlds=most_worlds, progress=progress
-        )
-        report = make_report(rows, recipe, time.perf_counter() - began, stepping)
+        if cluster is None:
+            most = min(most_worlds, recipe.episodes)
+            worlds = make_worlds(about["task"], about["robot"], about["control_hz"], most=most, progress=progress)
+            stepping = time.perf_counter()
+            ended = _run(worlds, policy, recipe, range(recipe.episodes), part / "episodes")
+        else:
+            load_policy(policy)  # a policy that cannot be loaded shows here and not on a worker
+            stepping = time.perf_counter()
+            ended = _run_on(cluster, policy, recipe, part / "episodes")
+        rows = []
+        with progress(f"evaluate {about['task']}", recipe.episodes) as bar:
+            for row in ended:
+                rows.append(row)
+                rate = sum(row["steps"] for row in rows) / (time.perf_counter() - stepping)
+                bar.advance(note=f"{sum(row['success'] for row in rows)} of {len(rows)} solved, {rate:.0f} steps/s")
+        rows.sort(key=lambda row: row["index"])
+        now = time.perf_counter()
+        report = make_report(rows, recipe, now - began, now - stepping)
         write_json(part / REPORT, asdict(report))
         write_manifest(
             part, kind="evaluation", recipe=used, parents={str(policy): sha256(policy)}, seed=recipe.seed,
@@ -97,31 +115,19 @@ def evaluate(
     return report
 
 
-def run_episodes(
-    policy: Path,
-    recipe: EvalRecipe,
-    indices: Sequence[int],
-    episodes: Path,
-    *,
-    most_worlds: int,
-    progress: Progress = silent,
-) -> tuple[list[dict[str, Any]], float]:
-    """Run the episodes of some numbers; their recordings land in the folder `episodes`.
-
-    Returns a row for each, its index and its outcome, in the order of the numbers, and the wall time of the steps [s].
-    """
-    about = about_policy(policy)
-    used = {**about["recipe"], "eval": as_table(recipe)}
-    hz = about["control_hz"]
-    worlds = make_worlds(about["task"], about["robot"], hz, most=min(most_worlds, len(indices)), progress=progress)
-    learned = LearnedPolicy(policy, worlds[0].spec)
+def _run(
+    worlds: Sequence[World], policy: Path, recipe: EvalRecipe, indices: Sequence[int], episodes: Path
+) -> Iterator[dict[str, Any]]:
+    """Run the episodes of some numbers and record them into a folder; a row for each, its index and its outcome."""
+    learned, hz = LearnedPolicy(policy, worlds[0].spec), worlds[0].spec.control_hz
+    used = {**about_policy(policy)["recipe"], "eval": as_table(recipe)}
 
     def start(index: int) -> Start:
         origin = Origin(stage=STAGE, policy=learned.name, seed=recipe.seed, index=index, recipe=used)
         recorder = McapRecorder(episodes / f"episode_{index:06d}{SUFFIX}", origin, keep_failures=True)
         return Start(index=index, rng=episode_rng(STAGE, recipe.seed, index), observers=[recorder])
 
-    waiting, rows = iter(indices), []
+    waiting = iter(indices)
     ended = rollouts(
         worlds,
         AskedOnce(learned),
@@ -129,13 +135,31 @@ def run_episodes(
         horizon=round(recipe.max_seconds * hz),
         hold_steps=max(1, round(recipe.hold_seconds * hz)),
     )
-    began = time.perf_counter()
-    with progress(f"evaluate {about['task']}", len(indices)) as bar:
-        for begun, outcome in ended:
-            rows.append({"index": begun.index, **asdict(outcome)})
-            rate = sum(row["steps"] for row in rows) / (time.perf_counter() - began)
-            bar.advance(note=f"{sum(row['success'] for row in rows)} of {len(rows)} solved, {rate:.0f} steps/s")
-    return sorted(rows, key=lambda row: row["index"]), time.perf_counter() - began
+    for begun, outcome in ended:
+        yield {"index": begun.index, **asdict(outcome)}
+
+
+def _run_on(cluster: UnitMap, policy: Path, recipe: EvalRecipe, episodes: Path) -> Iterator[dict[str, Any]]:
+    """Run all episodes on a cluster; their recordings come back as bytes."""
+    robot = load_robot(about_policy(policy)["robot"])
+    shared = packed(policy), recipe, robot
+    for _, (rows, files) in cluster(_unit, shared, batches(recipe.episodes, cluster.cpus)):
+        unpack(files, episodes)
+        yield from rows
+
+
+def _unit(
+    shared: tuple[dict[str, bytes], EvalRecipe, RobotConfig], indices: Sequence[int]
+) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+    """A worker's part of an evaluation: rows, and recordings by name."""
+    files, recipe, robot = shared
+    with TemporaryDirectory() as folder:
+        policy, episodes = Path(folder) / "policy", Path(folder) / "episodes"
+        unpack(files, policy)
+        episodes.mkdir()
+        about = about_policy(policy)
+        world = kept_world(about["task"], about["robot"], robot, about["control_hz"])
+        return list(_run([world], policy, recipe, indices, episodes)), packed(episodes)
 
 
 def make_report(rows: Sequence[Mapping[str, Any]], recipe: EvalRecipe, seconds: float, stepping: float) -> Report:

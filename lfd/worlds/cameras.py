@@ -12,7 +12,8 @@ import ctypes.util
 import logging
 import os
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import product
@@ -24,12 +25,9 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from lfd.core.errors import InputError, SimulationError, UnknownName
+from lfd.worlds.rendering import BACKENDS, OFF, advice, wished
 
 STATE, EVERYTHING = mujoco.mjtState.mjSTATE_INTEGRATION, mujoco.mjtCatBit.mjCAT_ALL.value
-BACKENDS = {"egl": ("EGL", "libegl1 libgl1"), "osmesa": ("OSMesa", "libosmesa6")}
-"""Ways to draw without a screen, the best first, each with its library and the Debian packages that bring it."""
-OFF = ("disable", "disabled", "off", "false", "0")
-"""Values of MUJOCO_GL that turn rendering off."""
 SMALL = 128 * 128
 """Up to here [pixels] edges are antialiased. Above, that would cost Mesa's CPU renderer more than everything else,
 and edges are a smaller part of the picture."""
@@ -50,8 +48,7 @@ logger = logging.getLogger(__name__)
 class Cameras:
     """Draws cameras of one model, always with the same picture size.
 
-    Belongs to the thread that made it, as an OpenGL context does: make, use and close it there. Several may
-    live in one process.
+    Several may live in one process; any thread may use one, but only one at a time.
 
     Raises `UnknownName` for a camera that the model does not have, `InputError` for a size that is not
     positive, `SimulationError` when this machine cannot draw offscreen.
@@ -76,9 +73,9 @@ class Cameras:
         self._option.sitegroup[:] = 0  # robosuite hides them
         self._scene = mujoco.MjvScene(model, maxgeom=10_000)
         self._gl = start_gl(height, width)
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)  # uploads meshes and textures
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        with _current(self._gl):
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)  # uploads meshes and textures
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         atexit.register(_close, weakref.ref(self))  # before EGL itself ends
 
     def follow(self, model: mujoco.MjModel) -> None:
@@ -104,15 +101,15 @@ class Cameras:
         mujoco.mj_setState(self._model, self._data, np.array(sim_state), STATE)
         for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_camlight, mujoco.mj_tendon):
             stage(self._model, self._data)
-        self._gl.make_current()  # another renderer of this thread may have been at work
-        return {name: self._draw(camera) for name, camera in self._ids.items()}
+        with _current(self._gl):
+            return {name: self._draw(camera) for name, camera in self._ids.items()}
 
     def close(self) -> None:
         """Free what the graphics library holds."""
         if self._gl is not None:
-            self._gl.make_current()
-            if self._context is not None:
-                self._context.free()
+            with _current(self._gl):
+                if self._context is not None:
+                    self._context.free()
             self._gl.free()
         self._gl = self._context = None
 
@@ -171,16 +168,14 @@ def start_gl(height: int, width: int) -> Any:
     (robosuite sets MUJOCO_GL=egl by itself, so that value is no wish.) Raises `SimulationError` naming the
     packages to install.
     """
-    wish = os.environ.get("MUJOCO_GL", "").strip().lower()
+    wish = wished()
     if wish in OFF:
         raise SimulationError(f"MUJOCO_GL={wish} turns rendering off; unset MUJOCO_GL to use cameras")
     loaded = os.environ.get("PYOPENGL_PLATFORM", "").lower()
     allowed = [loaded] if loaded in BACKENDS else ["osmesa"] if wish == "osmesa" else list(BACKENDS)
     found = [name for name in allowed if ctypes.util.find_library(BACKENDS[name][0])]
-    packages = " or ".join(f"`apt install {BACKENDS[name][1]}` ({name})" for name in allowed)
-    advice = f"On Debian or Ubuntu: {packages}. `lfd doctor` shows what works."
     if not found:
-        raise SimulationError(f"cameras need a library for offscreen rendering, none was found. {advice}")
+        raise SimulationError(f"cameras need a library for offscreen rendering, none was found. {advice(allowed)}")
     if found[0] != next(iter(BACKENDS)) and wish != found[0]:
         logger.warning("EGL's library is missing: cameras use OSMesa, which is slower")
     try:
@@ -188,7 +183,33 @@ def start_gl(height: int, width: int) -> Any:
     except Exception as error:  # PyOpenGL raises whatever its library says, down to AttributeError
         other = " Another way may work: MUJOCO_GL=osmesa." if found[0] == "egl" else ""
         reason = str(error).rstrip(".")
-        raise SimulationError(f"offscreen rendering by {found[0]} does not start: {reason}. {advice}{other}") from error
+        raise SimulationError(
+            f"offscreen rendering by {found[0]} does not start: {reason}. {advice(allowed)}{other}"
+        ) from error
+
+
+@contextmanager
+def _current(gl: Any) -> Iterator[None]:
+    """Draw with an OpenGL context in this thread, and leave it free for others."""
+    let_go = _let_go_of_egl if "egl" in type(gl).__module__ else _let_go_of_osmesa
+    gl.make_current()
+    try:
+        yield
+    finally:
+        let_go()
+
+
+def _let_go_of_egl() -> None:
+    from mujoco.egl import EGL, EGL_DISPLAY
+
+    EGL.eglBindAPI(EGL.EGL_OPENGL_API)  # each thread has its own choice, and lets go of the context of that kind
+    EGL.eglMakeCurrent(EGL_DISPLAY, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
+
+
+def _let_go_of_osmesa() -> None:
+    from mujoco.osmesa import GL, osmesa
+
+    osmesa.OSMesaMakeCurrent(None, None, GL.GL_FLOAT, 0, 0)
 
 
 def simplify(

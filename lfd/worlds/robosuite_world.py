@@ -11,16 +11,18 @@ import os
 import random
 import threading
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from lfd.core.errors import InputError, SimulationError
 from lfd.core.protocols import Observation, Progress, StepResult, WorldSpec, WorldState, silent
+from lfd.worlds.cameras import Cameras
 from lfd.worlds.drawn_sizes import draw_sizes
 from lfd.worlds.environments import make_environment
 from lfd.worlds.observing import Sight
@@ -53,6 +55,7 @@ class RobosuiteWorld:
         for observable in self._env._observables.values():
             observable.set_enabled(False)  # read by nobody here
         self._task, self._wanted, self._has_clipped = task, stepper, False
+        self._cameras: Cameras | None = None
         self._attach()
         if stepper == "auto":
             self._choose_stepper()
@@ -140,6 +143,18 @@ class RobosuiteWorld:
         state = np.empty(len(self._before))
         mujoco.mj_getState(self._model, self._data, state, INTEGRATION)
         return state
+
+    def take_cameras(self, names: Sequence[str], *, height: int, width: int) -> None:
+        """Have `pictures` show what some of the model's cameras see; raises what `Cameras` raises."""
+        self._cameras = Cameras(self._portable_xml(), names, height=height, width=width)
+        self.spec = replace(self.spec, cameras=tuple(names))
+
+    def pictures(self) -> Mapping[str, UInt8[np.ndarray, "H W 3"]]:
+        """What the cameras of `take_cameras` see now, RGB; none without it."""
+        if self._cameras is None:
+            return {}
+        self._cameras.follow(self._model)  # a reset may have changed sizes and places
+        return self._cameras.render(self.sim_state())
 
     def get_state(self) -> WorldState:
         """Everything that decides the future: physics, controllers, grippers, the task's own memory, the model."""
@@ -336,6 +351,12 @@ def make_worlds(
             worlds.append(make_world(task, robot, control_hz))
             bar.advance()
     return worlds
+
+
+@lru_cache(maxsize=1)
+def kept_world(task: str, robot_name: str, robot: RobotConfig, control_hz: int) -> RobosuiteWorld:
+    """The world of a worker that takes one unit of work after another: built once."""
+    return RobosuiteWorld(task=load_task(task), robot_name=robot_name, robot=robot, control_hz=control_hz)
 
 
 def _cores() -> int:
