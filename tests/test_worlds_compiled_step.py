@@ -56,6 +56,17 @@ def test_the_yardstick_is_robosuite_itself() -> None:
     assert not Comparison(0, ours=float("nan"), itself=0.0).is_same
 
 
+def test_sensors_hold_what_they_would_after_robosuites_step(lift_world, rng) -> None:
+    lift_world.reset(rng)
+    start, action, sensed = lift_world.get_state(), rng.uniform(-1, 1, 7), []
+    for name in ("compiled", "robosuite"):
+        lift_world.set_state(start)
+        make_stepper(name, lift_world._env).step(action)
+        sensed.append(lift_world._data.sensordata.copy())
+    assert np.abs(sensed[0]).max() > 1
+    np.testing.assert_allclose(sensed[0], sensed[1], atol=1e-6)
+
+
 def test_a_wrong_gain_is_noticed(lift_world, rng, monkeypatch) -> None:
     """The comparison can fail."""
     lift_world.reset(rng)
@@ -63,7 +74,7 @@ def test_a_wrong_gain_is_noticed(lift_world, rng, monkeypatch) -> None:
 
     def softer(self, env) -> None:
         init(self, env)
-        self._arms.kp[:] *= 1 + 1e-6
+        self._arms["kp"] *= 1 + 1e-6
 
     monkeypatch.setattr(CompiledStepper, "__init__", softer)
     assert not compare(lift_world, random_actions(lift_world, rng, 2)).is_same
@@ -102,9 +113,9 @@ def test_a_substep_left_to_robosuite_fits_in(task, robot, controller, rng) -> No
 def test_a_singular_matrix_is_noticed_before_the_substep(lift_world) -> None:
     lift_world.reset(np.random.default_rng(4))
     stepper = CompiledStepper(lift_world._env)
-    assert stepper._memory.stale.all()  # so the Jacobian below is used as it is
+    assert stepper._memory["stale"].all()  # so the Jacobian below is used as it is
     before = lift_world._data.time, lift_world._data.qvel.copy()
-    stepper._memory.jacobian[:] = 0.0
+    stepper._memory["jacobian"] = 0.0
     args = stepper._physics, stepper._arms, stepper._grippers, stepper._memory, stepper._scratch
     assert stepper._control_step(*args, np.zeros(7), 0, 25) == 0
     assert lift_world._data.time == before[0]

@@ -22,7 +22,7 @@ is left to robosuite.
 """
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import llvmlite.binding
 import mujoco
@@ -32,7 +32,9 @@ from numba import njit, types
 LIBRARY = next(Path(mujoco.__file__).parent.glob("libmujoco*"))
 NULL_STIFFNESS = 10.0
 OSC, JOINT_POSITION, JOINT_VELOCITY, JOINT_TORQUE = range(4)
-"""Kinds of controllers, as `Arms.kind` has them."""
+"""Kinds of controllers, as ARM's `kind` has them."""
+JOINTS = 8
+"""Most joints of an arm, and most components of its action, that there is room for."""
 CHANGES = 5
 """Length of JOINT_VELOCITY's buffer of changes of the error."""
 
@@ -61,110 +63,97 @@ class Physics(NamedTuple):
     qfrc_bias: np.ndarray
     site_xpos: np.ndarray
     site_xmat: np.ndarray
-
-
-class Arms(NamedTuple):
-    """The arms and their controllers as robosuite configured them.
-
-    The first axis of every array is the arm. A second axis is its joint (n), or the component of its action
-    or of its gains (w); what an arm does not have is never read.
-    """
-
-    kind: np.ndarray
-    joints: np.ndarray
-    """Number of joints of each arm."""
-    site: np.ndarray
-    qpos: np.ndarray
-    qvel: np.ndarray
-    actuators: np.ndarray
-    torque_low: np.ndarray
-    torque_high: np.ndarray
-    mass_at: np.ndarray
-    """Where the entries of the arm's mass matrix stand in mjData's sparse one, (arms, n, n); -1 for a zero."""
-    kp: np.ndarray
-    kd: np.ndarray
-    ki: np.ndarray
-    action_at: np.ndarray
-    """Where the arm's part of the action begins, and how long it is."""
-    width: np.ndarray
-    input_low: np.ndarray
-    input_high: np.ndarray
-    scale: np.ndarray
-    input_middle: np.ndarray
-    output_middle: np.ndarray
-    goal_low: np.ndarray
-    """Limits of the scaled goal of the joint controllers: velocities, torques or positions."""
-    goal_high: np.ndarray
-    turns: np.ndarray
-    """Whether the action turns the hand (OSC_POSE)."""
-    uncoupled: np.ndarray
-    base_site: np.ndarray
-    """Site of the frame in which the action moves the hand, and whether that frame moves (an IIWA's turns with
-    its first joint)."""
-    base_moves: np.ndarray
-
-
-class Grippers(NamedTuple):
-    """The grippers: each control step moves a gripper's position by `step` along the sign of its action.
-
-    A position of -1 to 1 is mapped linearly onto the range of the actuator's control.
-    """
-
-    action_at: np.ndarray
-    actuators: np.ndarray
-    """(grippers, fingers), -1 where a gripper has fewer fingers."""
-    step: np.ndarray
-    middle: np.ndarray
-    reach: np.ndarray
-    position: np.ndarray
-
-
-class Memory(NamedTuple):
-    """What the controllers keep between control steps, and what they have computed of the present state."""
-
-    stale: np.ndarray
-    """Whether the first substep takes the arrays below as they are, as robosuite does after a reset."""
-    rest: np.ndarray
-    """Joint positions that the null space is drawn to [rad]."""
-    joint_pos: np.ndarray
-    joint_vel: np.ndarray
-    position: np.ndarray
-    rotation: np.ndarray
-    velocity: np.ndarray
-    """Linear and angular velocity of the hand, (arms, 6)."""
-    jacobian: np.ndarray
-    """Transposed, (arms, n, 6)."""
-    mass: np.ndarray
-    goal_pos: np.ndarray
-    """Goal of OSC in the frame of the base: position, and rotation matrix."""
-    goal_mat: np.ndarray
-    goal: np.ndarray
-    """Goal of the joint controllers, (arms, n)."""
-    last_error: np.ndarray
-    error_sum: np.ndarray
-    changes: np.ndarray
-    """Ring buffer of the changes of the error, (arms, 5, n); where it was last written; how many it holds."""
-    newest: np.ndarray
-    filled: np.ndarray
-    saturated: np.ndarray
-
-
-class Scratch(NamedTuple):
-    """Room for intermediate results."""
-
     jac_pos: np.ndarray
+    """Room for a site's Jacobians, (3, nv)."""
     jac_rot: np.ndarray
-    factor: np.ndarray
-    spread: np.ndarray
-    inertia: np.ndarray
-    block: np.ndarray
-    tau: np.ndarray
-    pull: np.ndarray
-    wrench: np.ndarray
-    lost: np.ndarray
-    speed: np.ndarray
-    goal_pos: np.ndarray
-    goal_mat: np.ndarray
+
+
+def _record(**fields: object) -> np.dtype:
+    """A structured type: each field's type, or its type and shape."""
+    return np.dtype(
+        [(name, *(kind if isinstance(kind, tuple) else (kind,))) for name, kind in fields.items()], align=True
+    )
+
+
+_vector, _indices = (np.float64, (JOINTS,)), (np.int64, (JOINTS,))
+_square, _place, _turn = (np.float64, (JOINTS, JOINTS)), (np.float64, (3,)), (np.float64, (3, 3))
+
+ARM = _record(
+    kind=np.int64,
+    joints=np.int64,  # number of joints, n; what lies beyond n in the arrays below is never read
+    site=np.int64,
+    qpos=_indices,
+    qvel=_indices,
+    actuators=_indices,
+    torque_low=_vector,
+    torque_high=_vector,
+    mass_at=(np.int64, (JOINTS, JOINTS)),  # where the mass matrix stands in mjData's sparse one; -1 for a zero
+    kp=_vector,
+    kd=_vector,
+    ki=_vector,
+    action_at=np.int64,  # where the arm's part of the action begins, and how long it is
+    width=np.int64,
+    input_low=_vector,
+    input_high=_vector,
+    scale=_vector,
+    input_middle=_vector,
+    output_middle=_vector,
+    goal_low=_vector,  # limits of the scaled goal of the joint controllers: velocities, torques or positions
+    goal_high=_vector,
+    turns=np.bool_,  # whether the action turns the hand (OSC_POSE)
+    uncoupled=np.bool_,
+    base_site=np.int64,  # site of the frame in which the action moves the hand
+    base_moves=np.bool_,  # an IIWA's turns with its first joint
+)
+"""An arm and its controller as robosuite configured them."""
+
+GRIPPER = _record(
+    action_at=np.int64,
+    fingers=np.int64,
+    actuators=_indices,
+    step=_vector,  # each control step moves the position by this along the sign of the action, within -1 to 1
+    middle=_vector,  # the actuator's control is middle + reach * position
+    reach=_vector,
+    position=_vector,
+)
+"""A gripper; without fingers where an arm has none."""
+
+MEMORY = _record(
+    stale=np.bool_,  # whether the first substep takes what follows as it is, as robosuite does after a reset
+    rest=_vector,  # joint positions that the null space is drawn to [rad]
+    joint_pos=_vector,
+    joint_vel=_vector,
+    position=_place,
+    rotation=_turn,
+    velocity=(np.float64, (6,)),  # of the hand, linear and angular
+    jacobian=(np.float64, (JOINTS, 6)),  # transposed
+    mass=_square,
+    goal_pos=_place,  # goal of OSC in the frame of the base: position, and rotation matrix
+    goal_mat=_turn,
+    goal=_vector,  # goal of the joint controllers
+    last_error=_vector,  # JOINT_VELOCITY's filter
+    error_sum=_vector,
+    changes=(np.float64, (CHANGES, JOINTS)),  # ring buffer of the changes of the error
+    newest=np.int64,  # where it was last written, and how many it holds
+    filled=np.int64,
+    saturated=np.bool_,
+)
+"""What an arm's controller keeps between control steps, and what it has computed of the present state."""
+
+SCRATCH = _record(
+    factor=_square,
+    spread=(np.float64, (JOINTS, 6)),
+    inertia=(np.float64, (6, 6)),
+    block=_turn,
+    tau=_vector,
+    pull=_vector,
+    wrench=(np.float64, (6,)),
+    lost=(np.float64, (6,)),
+    speed=(np.float64, (6,)),
+    goal_pos=_place,
+    goal_mat=_turn,
+)
+"""Room for intermediate results."""
 
 
 @compiled
@@ -227,87 +216,87 @@ def _rotation(turn: np.ndarray) -> np.ndarray:
 
 
 @inlined
-def _present(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> None:
-    """Write what arm `a`'s controller needs of the present state over the memory's arrays."""
-    n = arms.joints[a]
+def _present(p: Physics, arm: Any, m: Any) -> None:
+    """Write what an arm's controller needs of the present state over the memory's arrays."""
+    n = arm.joints
     for i in range(n):
-        m.joint_pos[a, i], m.joint_vel[a, i] = p.qpos[arms.qpos[a, i]], p.qvel[arms.qvel[a, i]]
-    kind = arms.kind[a]
+        m.joint_pos[i], m.joint_vel[i] = p.qpos[arm.qpos[i]], p.qvel[arm.qvel[i]]
+    kind = arm.kind
     if kind != JOINT_VELOCITY and kind != JOINT_TORQUE:
         for i in range(n):
             for j in range(n):
-                at = arms.mass_at[a, i, j]
-                m.mass[a, i, j] = p.qM[at] if at >= 0 else 0.0
+                at = arm.mass_at[i, j]
+                m.mass[i, j] = p.qM[at] if at >= 0 else 0.0
     if kind == OSC:
-        site = arms.site[a]
-        mj_jacSite(p.model, p.data, s.jac_pos.ctypes.data, s.jac_rot.ctypes.data, site)
+        site = arm.site
+        mj_jacSite(p.model, p.data, p.jac_pos.ctypes.data, p.jac_rot.ctypes.data, site)
         for i in range(3):
-            m.position[a, i] = p.site_xpos[site, i]
+            m.position[i] = p.site_xpos[site, i]
             for j in range(3):
-                m.rotation[a, i, j] = p.site_xmat[site, 3 * i + j]
+                m.rotation[i, j] = p.site_xmat[site, 3 * i + j]
         for i in range(6):
-            m.velocity[a, i] = 0.0
+            m.velocity[i] = 0.0
         for k in range(n):
-            column, speed = arms.qvel[a, k], m.joint_vel[a, k]
+            column, speed = arm.qvel[k], m.joint_vel[k]
             for i in range(3):
-                m.jacobian[a, k, i] = s.jac_pos[i, column]
-                m.jacobian[a, k, 3 + i] = s.jac_rot[i, column]
+                m.jacobian[k, i] = p.jac_pos[i, column]
+                m.jacobian[k, 3 + i] = p.jac_rot[i, column]
             for i in range(6):
-                m.velocity[a, i] += m.jacobian[a, k, i] * speed
+                m.velocity[i] += m.jacobian[k, i] * speed
 
 
 @inlined
-def _set_goal(p: Physics, arms: Arms, a: int, m: Memory, action: np.ndarray) -> None:
-    """What arm `a`'s part of an action asks for; an OSC goal is the present pose, moved, in the base's frame."""
-    change = np.zeros(max(6, arms.width[a]))
-    for i in range(arms.width[a]):
-        bounded = min(max(action[arms.action_at[a] + i], arms.input_low[a, i]), arms.input_high[a, i])
-        change[i] = (bounded - arms.input_middle[a, i]) * arms.scale[a, i] + arms.output_middle[a, i]
-    if arms.kind[a] == OSC:
-        turn = _rotation(change[3:6] if arms.turns[a] else np.zeros(3))
-        base = arms.base_site[a]
+def _set_goal(p: Physics, arm: Any, m: Any, action: np.ndarray) -> None:
+    """What an arm's part of an action asks for; an OSC goal is the present pose, moved, in the base's frame."""
+    change = np.zeros(max(6, arm.width))
+    for i in range(arm.width):
+        bounded = min(max(action[arm.action_at + i], arm.input_low[i]), arm.input_high[i])
+        change[i] = (bounded - arm.input_middle[i]) * arm.scale[i] + arm.output_middle[i]
+    if arm.kind == OSC:
+        turn = _rotation(change[3:6] if arm.turns else np.zeros(3))
+        base = arm.base_site
         for i in range(3):
-            m.goal_pos[a, i] = change[i]
+            m.goal_pos[i] = change[i]
             for j in range(3):
-                m.goal_pos[a, i] += p.site_xmat[base, 3 * j + i] * (m.position[a, j] - p.site_xpos[base, j])
-                m.goal_mat[a, i, j] = 0.0
+                m.goal_pos[i] += p.site_xmat[base, 3 * j + i] * (m.position[j] - p.site_xpos[base, j])
+                m.goal_mat[i, j] = 0.0
                 for k in range(3):
                     for c in range(3):
-                        m.goal_mat[a, i, j] += turn[i, k] * p.site_xmat[base, 3 * c + k] * m.rotation[a, c, j]
+                        m.goal_mat[i, j] += turn[i, k] * p.site_xmat[base, 3 * c + k] * m.rotation[c, j]
     else:
-        for i in range(arms.joints[a]):
-            goal = change[i] + (m.joint_pos[a, i] if arms.kind[a] == JOINT_POSITION else 0.0)
-            m.goal[a, i] = min(max(goal, arms.goal_low[a, i]), arms.goal_high[a, i])
+        for i in range(arm.joints):
+            goal = change[i] + (m.joint_pos[i] if arm.kind == JOINT_POSITION else 0.0)
+            m.goal[i] = min(max(goal, arm.goal_low[i]), arm.goal_high[i])
 
 
 @inlined
-def _osc(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> bool:
+def _osc(p: Physics, arm: Any, m: Any, s: Any) -> bool:
     """Torques of operational space control, without the bias, in `s.tau`; False when a matrix is singular."""
-    n, jac, mass, rotation, goal_mat = arms.joints[a], m.jacobian[a], m.mass[a], m.rotation[a], s.goal_mat
-    base = arms.base_site[a]
+    n, jac, mass, rotation, goal_mat = arm.joints, m.jacobian, m.mass, m.rotation, s.goal_mat
+    base = arm.base_site
     for i in range(3):
         s.goal_pos[i] = p.site_xpos[base, i]
         for j in range(3):
-            s.goal_pos[i] += p.site_xmat[base, 3 * i + j] * m.goal_pos[a, j]
+            s.goal_pos[i] += p.site_xmat[base, 3 * i + j] * m.goal_pos[j]
             goal_mat[i, j] = 0.0
             for k in range(3):
-                goal_mat[i, j] += p.site_xmat[base, 3 * i + k] * m.goal_mat[a, k, j]
+                goal_mat[i, j] += p.site_xmat[base, 3 * i + k] * m.goal_mat[k, j]
     for i in range(6):
-        s.speed[i] = m.velocity[a, i]
-    if arms.base_moves[a]:
-        mj_jacSite(p.model, p.data, s.jac_pos.ctypes.data, s.jac_rot.ctypes.data, base)
+        s.speed[i] = m.velocity[i]
+    if arm.base_moves:
+        mj_jacSite(p.model, p.data, p.jac_pos.ctypes.data, p.jac_rot.ctypes.data, base)
         for k in range(n):
-            column = arms.qvel[a, k]
+            column = arm.qvel[k]
             for i in range(3):
-                s.speed[i] -= s.jac_pos[i, column] * p.qvel[column]
-                s.speed[3 + i] -= s.jac_rot[i, column] * p.qvel[column]
+                s.speed[i] -= p.jac_pos[i, column] * p.qvel[column]
+                s.speed[3 + i] -= p.jac_rot[i, column] * p.qvel[column]
     for i in range(3):  # e(R_goal, R) = 1/2 sum of the cross products of their columns
         j, k = (i + 1) % 3, (i + 2) % 3
         away = 0.0
         for c in range(3):
             away += 0.5 * (rotation[j, c] * goal_mat[k, c] - rotation[k, c] * goal_mat[j, c])
-        s.wrench[i] = arms.kp[a, i] * (s.goal_pos[i] - m.position[a, i]) - arms.kd[a, i] * s.speed[i]
-        s.wrench[3 + i] = arms.kp[a, 3 + i] * away - arms.kd[a, 3 + i] * s.speed[3 + i]
+        s.wrench[i] = arm.kp[i] * (s.goal_pos[i] - m.position[i]) - arm.kd[i] * s.speed[i]
+        s.wrench[3 + i] = arm.kp[3 + i] * away - arm.kd[3 + i] * s.speed[3 + i]
 
     for i in range(n):
         for j in range(i + 1):
@@ -326,7 +315,7 @@ def _osc(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> bool:
             for k in range(n):
                 entry += s.spread[k, i] * s.spread[k, j]
             s.inertia[i, j] = entry
-    if arms.uncoupled[a]:
+    if arm.uncoupled:
         for start in (0, 3):
             for i in range(3):
                 for j in range(i + 1):
@@ -344,9 +333,7 @@ def _osc(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> bool:
     for i in range(6):
         s.lost[i] = 0.0
     for k in range(n):
-        s.pull[k] = (
-            NULL_STIFFNESS * (m.rest[a, k] - m.joint_pos[a, k]) - 2 * np.sqrt(NULL_STIFFNESS) * m.joint_vel[a, k]
-        )
+        s.pull[k] = NULL_STIFFNESS * (m.rest[k] - m.joint_pos[k]) - 2 * np.sqrt(NULL_STIFFNESS) * m.joint_vel[k]
         for i in range(6):
             s.lost[i] += jac[k, i] * s.pull[k]
     _solve(s.inertia, s.lost, 6, 0)
@@ -361,84 +348,91 @@ def _osc(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> bool:
 
 
 @inlined
-def _velocity_control(arms: Arms, a: int, m: Memory, s: Scratch) -> None:
+def _velocity_control(arm: Any, m: Any, s: Any) -> None:
     """Torques of JOINT_VELOCITY's PID controller, without the bias, in `s.tau`."""
-    m.newest[a] = (m.newest[a] + 1) % CHANGES
-    m.filled[a] = min(m.filled[a] + 1, CHANGES)
-    for i in range(arms.joints[a]):
-        error = m.goal[a, i] - m.joint_vel[a, i]
-        m.changes[a, m.newest[a], i] = error - m.last_error[a, i]
-        m.last_error[a, i] = error
-        if not m.saturated[a]:
-            m.error_sum[a, i] += error
+    m.newest = (m.newest + 1) % CHANGES
+    m.filled = min(m.filled + 1, CHANGES)
+    for i in range(arm.joints):
+        error = m.goal[i] - m.joint_vel[i]
+        m.changes[m.newest, i] = error - m.last_error[i]
+        m.last_error[i] = error
+        if not m.saturated:
+            m.error_sum[i] += error
         change = 0.0
-        for k in range(m.filled[a]):
-            change += m.changes[a, k, i]
-        change /= m.filled[a]
-        s.tau[i] = arms.kp[a, i] * error + arms.ki[a, i] * m.error_sum[a, i] + arms.kd[a, i] * change
+        for k in range(m.filled):
+            change += m.changes[k, i]
+        change /= m.filled
+        s.tau[i] = arm.kp[i] * error + arm.ki[i] * m.error_sum[i] + arm.kd[i] * change
 
 
 @inlined
-def _torques(p: Physics, arms: Arms, a: int, m: Memory, s: Scratch) -> bool:
-    """Torques of arm `a`'s controller, without the bias, in `s.tau`; False when a matrix is singular."""
-    n, kind = arms.joints[a], arms.kind[a]
+def _torques(p: Physics, arm: Any, m: Any, s: Any) -> bool:
+    """Torques of an arm's controller, without the bias, in `s.tau`; False when a matrix is singular."""
+    n, kind = arm.joints, arm.kind
     if kind == OSC:
-        return _osc(p, arms, a, m, s)
+        return _osc(p, arm, m, s)
     if kind == JOINT_VELOCITY:
-        _velocity_control(arms, a, m, s)
+        _velocity_control(arm, m, s)
     elif kind == JOINT_TORQUE:
         for i in range(n):
-            s.tau[i] = m.goal[a, i]
+            s.tau[i] = m.goal[i]
     else:
         for i in range(n):
-            s.pull[i] = arms.kp[a, i] * (m.goal[a, i] - m.joint_pos[a, i]) - arms.kd[a, i] * m.joint_vel[a, i]
+            s.pull[i] = arm.kp[i] * (m.goal[i] - m.joint_pos[i]) - arm.kd[i] * m.joint_vel[i]
         for i in range(n):
             s.tau[i] = 0.0
             for j in range(n):
-                s.tau[i] += m.mass[a, i, j] * s.pull[j]
+                s.tau[i] += m.mass[i, j] * s.pull[j]
     return True
 
 
 @inlined
-def _close(p: Physics, grippers: Grippers, action: np.ndarray) -> None:
-    """Move the grippers' positions and write their controls, which do not change within a control step."""
-    for g in range(grippers.action_at.shape[0]):
-        for i in range(grippers.actuators.shape[1]):
-            if grippers.actuators[g, i] >= 0:
-                moved = grippers.position[g, i] + grippers.step[g, i] * np.sign(action[grippers.action_at[g]])
-                grippers.position[g, i] = min(max(moved, -1.0), 1.0)
-                p.ctrl[grippers.actuators[g, i]] = (
-                    grippers.middle[g, i] + grippers.reach[g, i] * grippers.position[g, i]
-                )
+def _close(p: Physics, gripper: Any, action: np.ndarray) -> None:
+    """Move a gripper and write its controls, which do not change within a control step."""
+    for i in range(gripper.fingers):
+        moved = gripper.position[i] + gripper.step[i] * np.sign(action[gripper.action_at])
+        gripper.position[i] = min(max(moved, -1.0), 1.0)
+        p.ctrl[gripper.actuators[i]] = gripper.middle[i] + gripper.reach[i] * gripper.position[i]
 
 
 @compiled
 def control_step(
-    p: Physics, arms: Arms, grippers: Grippers, m: Memory, s: Scratch, action: np.ndarray, start: int, stop: int
+    p: Physics,
+    arms: np.ndarray,
+    grippers: np.ndarray,
+    memory: np.ndarray,
+    scratch: np.ndarray,
+    action: np.ndarray,
+    start: int,
+    stop: int,
 ) -> int:
     """Advance the physics by the substeps `start` to `stop` of one control step; returns the first not taken.
 
-    That is `stop`, unless a matrix is singular. Substep 0 sets the goals and moves the grippers. Positions and
-    velocities in mjData are fresh (mj_step1) before and after.
+    That is `stop`, unless a matrix is singular. `arms`, `grippers` and `memory` have one record for each arm,
+    `scratch` one for all. Substep 0 sets the goals and moves the grippers. Positions and velocities in mjData are
+    fresh (mj_step1) before and after.
     """
+    s = scratch[0]
     if start == 0:
-        _close(p, grippers, action)
+        for a in range(grippers.shape[0]):
+            _close(p, grippers[a], action)
     for substep in range(start, stop):
-        for a in range(arms.kind.shape[0]):
-            if not m.stale[a]:
-                _present(p, arms, a, m, s)
+        for a in range(arms.shape[0]):
+            arm, m = arms[a], memory[a]
+            if not m.stale:
+                _present(p, arm, m)
             if substep == 0:
-                _set_goal(p, arms, a, m, action)
-            if not _torques(p, arms, a, m, s):
+                _set_goal(p, arm, m, action)
+            if not _torques(p, arm, m, s):
                 return substep
             saturated = False
-            for k in range(arms.joints[a]):
-                actuator, tau = arms.actuators[a, k], s.tau[k] + p.qfrc_bias[arms.qvel[a, k]]
-                p.ctrl[actuator] = min(max(tau, arms.torque_low[a, k]), arms.torque_high[a, k])
+            for k in range(arm.joints):
+                actuator, tau = arm.actuators[k], s.tau[k] + p.qfrc_bias[arm.qvel[k]]
+                p.ctrl[actuator] = min(max(tau, arm.torque_low[k]), arm.torque_high[k])
                 saturated |= p.ctrl[actuator] != tau
-            m.saturated[a] = saturated
-        for a in range(arms.kind.shape[0]):
-            m.stale[a] = False
+            m.saturated = saturated
+        for a in range(arms.shape[0]):
+            memory[a].stale = False
         mj_step2(p.model, p.data)
         mj_step1(p.model, p.data)
     return stop

@@ -11,6 +11,8 @@ from lfd.core.errors import SimulationError, UnknownName
 
 MUJOCO = "3.3.7"
 """The version whose C functions the compiled step calls; another one's signatures could crash the process."""
+MOST_JOINTS = 8
+"""Of an arm; `compiled_step.JOINTS`, which is not imported here because it loads the compiler."""
 OSC_NAMES = ("OSC_POSE", "OSC_POSITION")
 JOINT_NAMES = ("JOINT_POSITION", "JOINT_VELOCITY", "JOINT_TORQUE")
 
@@ -78,20 +80,14 @@ class CompiledStepper:
         self._physics = c.Physics(
             model=model._address,
             data=data._address,
-            **{name: getattr(data, name) for name in c.Physics._fields[2:]},
+            jac_pos=np.zeros((3, model.nv)),
+            jac_rot=np.zeros((3, model.nv)),
+            **{name: getattr(data, name) for name in c.Physics._fields[2:-2]},
         )
         arms = list(arms_of(env))
-        most = max(len(robot.composite_controller.part_controllers[arm].qpos_index) for robot, arm in arms)
-        self._arms = _stack(c.Arms, [_arm(env, robot, arm, max(most, 6)) for robot, arm in arms])
-        self._grippers = _stack(c.Grippers, [_gripper(env, robot, arm, model.nu) for robot, arm in arms])
-        self._fingers = (self._grippers.actuators >= 0).sum(axis=1)
-        self._memory = c.Memory(**_empty_memory(len(arms), max(most, 6), c.CHANGES))
-        self._scratch = c.Scratch(
-            jac_pos=np.zeros((3, model.nv)), jac_rot=np.zeros((3, model.nv)), factor=np.zeros((most, most)),
-            spread=np.zeros((most, 6)), inertia=np.zeros((6, 6)), block=np.zeros((3, 3)), tau=np.zeros(most),
-            pull=np.zeros(most), wrench=np.zeros(6), lost=np.zeros(6), speed=np.zeros(6),
-            goal_pos=np.zeros(3), goal_mat=np.zeros((3, 3)),
-        )  # fmt: skip
+        self._arms = _records(c.ARM, [_arm(env, robot, arm) for robot, arm in arms])
+        self._grippers = _records(c.GRIPPER, [_gripper(env, robot, arm) for robot, arm in arms])
+        self._memory, self._scratch = np.zeros(len(arms), c.MEMORY), np.zeros(1, c.SCRATCH)
         self._substeps = int(env.control_timestep / env.model_timestep)
         self.load()
 
@@ -106,57 +102,52 @@ class CompiledStepper:
                 at += 1
 
     def load(self) -> None:
-        m = self._memory
-        for a, (robot, arm) in enumerate(arms_of(self._env)):
+        for (robot, arm), m, held in zip(arms_of(self._env), self._memory, self._grippers, strict=True):
             part, gripper = robot.composite_controller.part_controllers[arm], robot.gripper[arm]
-            n = self._arms.joints[a]
-            m.stale[a] = not part.new_update
-            m.joint_pos[a, :n], m.joint_vel[a, :n] = part.joint_pos, part.joint_vel
-            m.mass[a, :n, :n] = part.mass_matrix
+            n = part.joint_dim
+            m["stale"] = not part.new_update
+            m["joint_pos"][:n], m["joint_vel"][:n] = part.joint_pos, part.joint_vel
+            m["mass"][:n, :n] = part.mass_matrix
             if part.name in OSC_NAMES:
-                m.rest[a, :n] = part.initial_joint
-                m.position[a], m.rotation[a] = part.ref_pos, part.ref_ori_mat
-                m.velocity[a] = *part.ref_pos_vel, *part.ref_ori_vel
-                m.jacobian[a, :n] = part.J_full.T
+                m["rest"][:n] = part.initial_joint
+                m["position"], m["rotation"] = part.ref_pos, part.ref_ori_mat
+                m["velocity"] = *part.ref_pos_vel, *part.ref_ori_vel
+                m["jacobian"][:n] = part.J_full.T
             if part.name == "JOINT_VELOCITY":
-                m.last_error[a, :n], m.error_sum[a, :n] = part.last_err, part.summed_err
-                m.changes[a, :, :n], m.newest[a], m.filled[a] = (
-                    part.derr_buf.buf,
-                    part.derr_buf.ptr,
-                    part.derr_buf._size,
-                )
-                m.saturated[a] = part.saturated
-            self._grippers.position[a, : self._fingers[a]] = gripper.current_action if gripper.dof else 0.0
+                m["last_error"][:n], m["error_sum"][:n] = part.last_err, part.summed_err
+                m["changes"][:, :n] = part.derr_buf.buf
+                m["newest"], m["filled"], m["saturated"] = part.derr_buf.ptr, part.derr_buf._size, part.saturated
+            held["position"][: held["fingers"]] = gripper.current_action if gripper.dof else 0.0
 
     def store(self) -> None:
-        m = self._memory
-        for a, (robot, arm) in enumerate(arms_of(self._env)):
+        for (robot, arm), m, held in zip(arms_of(self._env), self._memory, self._grippers, strict=True):
             part, gripper = robot.composite_controller.part_controllers[arm], robot.gripper[arm]
-            n = self._arms.joints[a]
-            if not m.stale[a]:
+            n = part.joint_dim
+            if not m["stale"]:
                 part.new_update = True
             if part.name == "JOINT_VELOCITY":
-                part.last_err, part.summed_err = m.last_error[a, :n].copy(), m.error_sum[a, :n].copy()
-                part.derr_buf.buf = m.changes[a, :, :n].copy()
-                part.derr_buf.ptr, part.derr_buf._size = int(m.newest[a]), int(m.filled[a])
-                part.saturated = bool(m.saturated[a])
+                part.last_err, part.summed_err = m["last_error"][:n].copy(), m["error_sum"][:n].copy()
+                part.derr_buf.buf = m["changes"][:, :n].copy()
+                part.derr_buf.ptr, part.derr_buf._size = int(m["newest"]), int(m["filled"])
+                part.saturated = bool(m["saturated"])
             if gripper.dof:
-                gripper.current_action = self._grippers.position[a, : self._fingers[a]].copy()
+                gripper.current_action = held["position"][: held["fingers"]].copy()
 
     def _robosuite_substep(self) -> None:
         """One substep by robosuite's controllers, towards the goals of this control step."""
         self.store()
-        for a, (robot, arm) in enumerate(arms_of(self._env)):
-            part, m, n = robot.composite_controller.part_controllers[arm], self._memory, self._arms.joints[a]
+        goals = {"JOINT_POSITION": "goal_qpos", "JOINT_VELOCITY": "goal_vel", "JOINT_TORQUE": "goal_torque"}
+        for (robot, arm), known, m in zip(arms_of(self._env), self._arms, self._memory, strict=True):
+            part = robot.composite_controller.part_controllers[arm]
+            n = part.joint_dim
             part.new_update = True
             if part.name in OSC_NAMES:
                 part.update_origin(*robot.composite_controller.get_controller_base_pose(arm))
-                part.goal_pos, part.goal_ori = m.goal_pos[a].copy(), m.goal_mat[a].copy()
+                part.goal_pos, part.goal_ori = m["goal_pos"].copy(), m["goal_mat"].copy()
             else:
-                goal = {"JOINT_POSITION": "goal_qpos", "JOINT_VELOCITY": "goal_vel", "JOINT_TORQUE": "goal_torque"}
-                setattr(part, goal[part.name], m.goal[a, :n].copy())
-            low, high = self._arms.torque_low[a, :n], self._arms.torque_high[a, :n]
-            self._physics.ctrl[self._arms.actuators[a, :n]] = np.clip(part.run_controller(), low, high)
+                setattr(part, goals[part.name], m["goal"][:n].copy())
+            torques = np.clip(part.run_controller(), known["torque_low"][:n], known["torque_high"][:n])
+            self._physics.ctrl[known["actuators"][:n]] = torques
         model, data = self._env.sim.model._model, self._env.sim.data._data
         mujoco.mj_step2(model, data)
         mujoco.mj_step1(model, data)
@@ -176,8 +167,8 @@ def action_start(env: Any, robot: Any, part: str) -> int:
     return before + robot.composite_controller._action_split_indexes[part][0]
 
 
-def _arm(env: Any, robot: Any, arm: str, size: int) -> dict[str, Any]:
-    """One arm's row of `compiled_step.Arms`, its arrays padded with zeros to `size`."""
+def _arm(env: Any, robot: Any, arm: str) -> dict[str, Any]:
+    """One arm's record, `compiled_step.ARM`."""
     from lfd.worlds import compiled_step as c
 
     part, model = robot.composite_controller.part_controllers[arm], env.sim.model._model
@@ -190,7 +181,8 @@ def _arm(env: Any, robot: Any, arm: str, size: int) -> dict[str, Any]:
         found = getattr(part, f"{limits}_limits")
         if found is not None:
             goal_low[:], goal_high[:] = found
-    rows = {
+    base = env.sim.model.site_name2id(f"{part.naming_prefix}{part.part_name}_center")
+    return {
         "qpos": np.array(part.qpos_index),
         "qvel": np.array(part.qvel_index),
         "actuators": actuators,
@@ -207,10 +199,6 @@ def _arm(env: Any, robot: Any, arm: str, size: int) -> dict[str, Any]:
         "output_middle": part.action_output_transform,
         "goal_low": goal_low,
         "goal_high": goal_high,
-    }
-    base = env.sim.model.site_name2id(f"{part.naming_prefix}{part.part_name}_center")
-    return {
-        **{name: _padded(np.asarray(row), size) for name, row in rows.items()},
         "kind": c.OSC if osc else 1 + JOINT_NAMES.index(part.name),
         "joints": n,
         "site": env.sim.model.site_name2id(part.ref_name),
@@ -223,20 +211,21 @@ def _arm(env: Any, robot: Any, arm: str, size: int) -> dict[str, Any]:
     }
 
 
-def _gripper(env: Any, robot: Any, arm: str, size: int) -> dict[str, Any]:
-    """One gripper's row of `compiled_step.Grippers`, padded to `size` fingers; all padding without a gripper."""
-    actuators, step, middle, reach = np.full(size, -1), np.zeros(size), np.zeros(size), np.zeros(size)
-    gripper, model, at = robot.gripper[arm], env.sim.model._model, 0
-    if gripper.dof:
-        driven = robot._ref_actuators_indexes_dict[f"{arm}_gripper"]
-        low, high = model.actuator_ctrlrange[driven].T
-        n, at = len(driven), action_start(env, robot, f"{arm}_gripper")
-        actuators[:n], middle[:n], reach[:n] = driven, 0.5 * (high + low), 0.5 * (high - low)
-        step[:n] = _moved(gripper, np.zeros(n), 1.0)
+def _gripper(env: Any, robot: Any, arm: str) -> dict[str, Any]:
+    """One gripper's record, `compiled_step.GRIPPER`; without fingers where the arm has none."""
+    gripper, model = robot.gripper[arm], env.sim.model._model
+    if not gripper.dof:
+        return {"fingers": 0}
+    driven = robot._ref_actuators_indexes_dict[f"{arm}_gripper"]
+    low, high = model.actuator_ctrlrange[driven].T
     return {
-        "action_at": at, "actuators": actuators, "step": step, "middle": middle, "reach": reach,
-        "position": np.zeros(size),
-    }  # fmt: skip
+        "action_at": action_start(env, robot, f"{arm}_gripper"),
+        "fingers": len(driven),
+        "actuators": np.array(driven),
+        "step": _moved(gripper, np.zeros(len(driven)), 1.0),
+        "middle": 0.5 * (high + low),
+        "reach": 0.5 * (high - low),
+    }
 
 
 def _moved(gripper: Any, position: np.ndarray, action: float) -> np.ndarray:
@@ -270,29 +259,16 @@ def _mass_addresses(model: Any) -> np.ndarray:
     return full.astype(np.int64) - 1
 
 
-def _padded(row: np.ndarray, size: int) -> np.ndarray:
-    return np.pad(row, [(0, size - length) for length in row.shape])
-
-
-def _stack(kind: Any, rows: list[dict[str, Any]]) -> Any:
-    return kind(
-        **{name: np.ascontiguousarray(np.stack([np.asarray(row[name]) for row in rows])) for name in kind._fields}
-    )
-
-
-def _empty_memory(arms: int, n: int, changes: int) -> dict[str, np.ndarray]:
-    vectors = ("rest", "joint_pos", "joint_vel", "goal", "last_error", "error_sum")
-    return {
-        **{name: np.zeros((arms, n)) for name in vectors},
-        **{name: np.zeros((arms, 3)) for name in ("position", "goal_pos")},
-        **{name: np.zeros((arms, 3, 3)) for name in ("rotation", "goal_mat")},
-        **{name: np.zeros(arms, dtype=np.int64) for name in ("newest", "filled")},
-        **{name: np.zeros(arms, dtype=np.bool_) for name in ("stale", "saturated")},
-        "velocity": np.zeros((arms, 6)),
-        "jacobian": np.zeros((arms, n, 6)),
-        "mass": np.zeros((arms, n, n)),
-        "changes": np.zeros((arms, changes, n)),
-    }
+def _records(kind: np.dtype, rows: list[dict[str, Any]]) -> np.ndarray:
+    """Records of a structured type; arrays that are shorter than their field are followed by zeros."""
+    made = np.zeros(len(rows), kind)
+    for record, row in zip(made, rows, strict=True):
+        for name, value in row.items():
+            if np.ndim(value):
+                record[name][tuple(slice(length) for length in np.shape(value))] = value
+            else:
+                record[name] = value
+    return made
 
 
 def uncovered(env: Any) -> str:
@@ -321,6 +297,8 @@ def uncovered(env: Any) -> str:
 def _uncovered_arm(part: Any) -> str:
     if part.name not in OSC_NAMES + JOINT_NAMES:
         return f"the controller {part.name}"
+    if part.joint_dim > MOST_JOINTS:
+        return f"an arm of {part.joint_dim} joints"
     if any(getattr(part, name, None) is not None for name in ("interpolator", "interpolator_pos", "interpolator_ori")):
         return "interpolators"
     as_it_is = {"impedance_mode": "fixed", "input_type": "delta", "input_ref_frame": "base"}
