@@ -171,6 +171,32 @@ def _eval(given: argparse.Namespace) -> Result:
     return {"out": str(given.out), **report}
 
 
+def _sweep(given: argparse.Namespace) -> Result:
+    from lfd.loops.sweep import sweep
+    from lfd.terminal import progress_bar
+
+    with _machines(given.cluster) as cluster:
+        rows = sweep(
+            given.recipe,
+            given.vary,
+            given.dataset,
+            given.out,
+            cluster=cluster,
+            overwrite=given.overwrite,
+            progress=progress_bar,
+        )
+    if given.json:
+        return {"out": str(given.out), "rows": rows}
+    best = {row.pop("folder"): ", ".join(f"{k} {_short(v)}" for k, v in row.items()) for row in rows}
+    return {"out": str(given.out), **best}
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_short, value)) + "]"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
 def _replay(given: argparse.Namespace) -> Result:
     from lfd.replay.clip import clip_of
     from lfd.replay.rerun_scene import replay
@@ -214,9 +240,40 @@ def _demo(given: argparse.Namespace) -> Result:
 
 
 def _bench(given: argparse.Namespace) -> Result:
-    from lfd.bench.matrix import bench_matrix, whole_matrix
-    from lfd.bench.sim import bench_everywhere, bench_sim
     from lfd.loops.results import write_section
+
+    measured, sections = _bench_sim(given) if given.suite == "sim" else _bench_cameras(given)
+    if given.results is not None:
+        command = f"lfd bench {given.suite}" + " --quick" * given.quick + " --full" * given.full
+        for title, rows in sections.items():
+            write_section(given.results, title, command, rows)
+    return measured
+
+
+def _bench_cameras(given: argparse.Namespace) -> tuple[Result, Result]:
+    from lfd.bench.cameras import bench_cameras
+    from lfd.terminal import progress_bar
+
+    measured = asdict(
+        bench_cameras(
+            task=given.task,
+            robot=given.robot,
+            control_hz=20,
+            cameras=("agentview", "robot0_eye_in_hand"),
+            sizes=(84, 256),
+            states=10 if given.quick else 40,
+            seed=given.seed,
+            progress=progress_bar,
+        )
+    )
+    rows = measured["ratios"] | {"mean difference [1/255]": measured["mean_difference"]}
+    rows |= {f"frames/s, {name}": rate for name, rate in measured["frames_per_second"].items()}
+    return measured, {f"Cameras: {given.task} with {given.robot}": rows}
+
+
+def _bench_sim(given: argparse.Namespace) -> tuple[Result, Result]:
+    from lfd.bench.matrix import bench_matrix, success_rates, whole_matrix
+    from lfd.bench.sim import bench_everywhere, bench_sim
     from lfd.terminal import progress_bar
 
     common: dict[str, Any] = {"control_hz": 20, "seed": given.seed, "progress": progress_bar}
@@ -229,16 +286,18 @@ def _bench(given: argparse.Namespace) -> Result:
     if given.full:
         measured["everywhere"] = bench_everywhere(**common)
         measured["matrix"] = asdict(bench_matrix(whole_matrix(), steps=10, **common))
+        rates = success_rates(task="Lift", robot="panda", episodes=100, **common)
+        measured["success"] = rates
+        said = {
+            name: f"{won} of 100, 95% interval {low:.1%} to {high:.1%}" for name, (won, (low, high)) in rates.items()
+        }
+        sections["Simulation: success of a noisy expert on both steppers"] = said
         sections["Simulation: every task with a Panda, every robot on Lift"] = {
             pair: ", ".join(f"{name} {value}" for name, value in ratios.items())
             for pair, ratios in measured["everywhere"].items()
         }
         sections["Simulation: same numbers as robosuite, every robot x controller x task"] = measured["matrix"]
-    if given.results is not None:
-        command = "lfd bench sim" + " --quick" * given.quick + " --full" * given.full
-        for title, rows in sections.items():
-            write_section(given.results, title, command, rows)
-    return measured
+    return measured, sections
 
 
 @contextmanager
@@ -296,16 +355,19 @@ def _parser() -> argparse.ArgumentParser:
             help="override any key of the recipe; `lfd info RECIPE` lists them; may be repeated",
         )  # fmt: skip
 
-    def parallel(made: Any) -> None:
-        made.add_argument(
-            "--worlds", type=_count, default=2**16, metavar="N",
-            help="worlds to run in parallel at the most; the result is the same (default: one a core)",
-        )  # fmt: skip
+    def cluster(made: Any) -> None:
         made.add_argument(
             "--cluster", nargs="?", const="local", metavar="ADDRESS",
             help="run on Ray, with the same result: `local` (also without an address) starts it on this machine, "
             "`auto` joins the one that runs here, ray://HOST:10001 another; needs pip install 'lfd[cluster]'",
         )  # fmt: skip
+
+    def parallel(made: Any) -> None:
+        made.add_argument(
+            "--worlds", type=_count, default=2**16, metavar="N",
+            help="worlds to run in parallel at the most; the result is the same (default: one a core)",
+        )  # fmt: skip
+        cluster(made)
 
     made = command(
         "record",
@@ -359,6 +421,21 @@ def _parser() -> argparse.ArgumentParser:
     output(made, "the report and the recordings of all episodes")
 
     made = command(
+        "sweep",
+        _sweep,
+        "train and evaluate a policy for every combination of some values of a recipe",
+        "lfd sweep policies/bc_mlp.toml --dataset outputs/dataset --vary train.seed=[0,1,2] --out outputs/sweep",
+    )
+    made.add_argument("recipe", type=Path, metavar="RECIPE", help="policy recipe: [policy], [train] and [eval] tables")
+    made.add_argument("--dataset", type=Path, required=True, metavar="DATASET", help="LeRobot dataset folder")
+    made.add_argument(
+        "--vary", action="append", required=True, metavar="TABLE.KEY=[VALUE,VALUE]",
+        help="values to try for a key of the recipe; may be repeated, all combinations are made",
+    )  # fmt: skip
+    cluster(made)
+    output(made, "the policies and their evaluations")
+
+    made = command(
         "replay",
         _replay,
         "show an episode in Rerun: the arm in 3-D, actions and joints as plots",
@@ -388,14 +465,15 @@ def _parser() -> argparse.ArgumentParser:
     made = command(
         "bench",
         _bench,
-        "measure the simulation: robosuite's step, ours, and the physics alone, side by side",
+        "measure speed side by side: sim (robosuite's step, ours, the physics alone) or cameras (robosuite's, ours)",
         "lfd bench sim --quick",
     )
-    made.add_argument("suite", choices=["sim"], help="what to measure")
+    made.add_argument("suite", choices=["sim", "cameras"], help="what to measure")
     made.add_argument("--quick", action="store_true", help="a tenth of the steps")
     made.add_argument(
         "--full", action="store_true",
-        help="also every task, every robot, and the numbers of every robot x controller x task; takes ten minutes",
+        help="sim: also every task and robot, success on both steppers, and the numbers of every robot x controller x "
+        "task; takes ten minutes",
     )  # fmt: skip
     made.add_argument(
         "--results", type=Path, metavar="PAGE.md", help="also write the table into a section of this page"

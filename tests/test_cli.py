@@ -12,7 +12,7 @@ from lfd.cli import main
 from lfd.record.episode_file import read_episode, recordings_in
 from tests.conftest import BC, LIFT, ROOT, call_json
 
-COMMANDS = ("record", "convert", "train", "eval", "replay", "info", "doctor", "bench", "demo")
+COMMANDS = ("record", "convert", "train", "eval", "sweep", "replay", "info", "doctor", "bench", "demo")
 
 
 @pytest.mark.parametrize("command", COMMANDS)

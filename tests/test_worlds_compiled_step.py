@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from lfd import make_expert, make_world
-from lfd.bench.matrix import compare_cases, quick_matrix, whole_matrix
+from lfd.bench.matrix import compare_cases, quick_matrix, success_rates, whole_matrix
 from lfd.core.errors import SimulationError, UnknownName
 from lfd.worlds import steppers
 from lfd.worlds.robots import CONTROLLERS, robot_names
@@ -40,6 +40,15 @@ def test_every_robot_controller_and_task_gives_robosuites_numbers() -> None:
     rows = list(compare_cases(quick_matrix(), control_hz=20, steps=3, seed=0))
     assert [row for row in rows if not row.found.is_same] == []
     assert sum(row.found.ours <= TOLERANCE for row in rows) > 0.9 * len(rows)
+
+
+@pytest.mark.slow
+def test_success_rates_agree_over_100_seeds() -> None:
+    rates = success_rates(task="Lift", robot="panda", control_hz=20, episodes=100, seed=3)
+    (ours, (our_low, our_high)), (theirs, (their_low, their_high)) = rates["compiled"], rates["robosuite"]
+    assert 5 <= theirs <= 95  # else nothing is compared
+    assert our_low <= theirs / 100 <= our_high
+    assert their_low <= ours / 100 <= their_high
 
 
 def test_the_quick_matrix_covers_every_pair() -> None:

@@ -6,8 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from lfd.core.protocols import Progress, silent
+from lfd.experts.noise import NoisyPolicy
+from lfd.experts.registry import make_expert
+from lfd.run.wilson import wilson_interval
 from lfd.worlds.robosuite_world import make_world
 from lfd.worlds.robots import CONTROLLERS, robot_names
+from lfd.worlds.rollout import episode_rng, rollout
 from lfd.worlds.same_numbers import TOLERANCE, Comparison, compare
 from lfd.worlds.tasks import TASKS
 
@@ -87,3 +91,25 @@ def bench_matrix(
         within_robosuites_own=len(rows) - len(exact) - len(beyond),
         beyond=beyond,
     )
+
+
+def success_rates(
+    *, task: str, robot: str, control_hz: int, episodes: int, seed: int, progress: Progress = silent
+) -> dict[str, tuple[int, tuple[float, float]]]:
+    """Successes, and the 95% Wilson interval of their rate, of one policy from the same starts on both steppers.
+
+    The policy is the scripted expert with so much noise on its actions, and so little time, that it often fails:
+    chaos makes single episodes end differently, their rates must not.
+    """
+    found = {}
+    with progress("success on both steppers", 2 * episodes) as bar:
+        for stepper in ("compiled", "robosuite"):
+            world = make_world(task, robot, control_hz, stepper)
+            policy, successes = NoisyPolicy(make_expert(world.spec), scale=0.3), 0
+            for episode in range(episodes):
+                rng = episode_rng("eval", seed, episode)
+                outcome = rollout(world, policy, [], rng, horizon=round(2.5 * control_hz), hold_steps=control_hz // 4)
+                successes += outcome.success
+                bar.advance(note=f"{stepper}: {successes} of {episode + 1}")
+            found[stepper] = successes, wilson_interval(successes, episodes)
+    return found

@@ -1,0 +1,110 @@
+"""Many policies from one dataset: every combination of some values of a policy recipe, trained and evaluated."""
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from lfd.core.artifact import check_output, packed, sha256, unpack, write_json, write_manifest
+from lfd.core.errors import RecipeError
+from lfd.core.protocols import Progress, UnitMap, silent
+from lfd.core.recipe import build, load_toml
+from lfd.run.evaluate import REPORT, EvalRecipe, evaluate
+from lfd.train.behavior_cloning import TrainRecipe, train
+from lfd.worlds.robosuite_world import EVERY_CORE
+
+TABLES = ("policy", "train", "eval")
+Tables = Mapping[str, dict[str, Any]]
+
+
+def combinations(recipe: Path, varied: Sequence[str]) -> list[tuple[dict[str, Any], Tables]]:
+    """What is varied, and the tables of the recipe with it, for every combination.
+
+    Each of `varied` is TABLE.KEY=[VALUE, VALUE] with TOML values. Raises `RecipeError` for one that is not, and
+    for a combination that is no recipe: before anything is trained.
+    """
+    choices: dict[str, list[Any]] = {}
+    for text in varied:
+        name, equals, _ = text.partition("=")
+        table, _, key = name.partition(".")
+        values = load_toml(recipe, TABLES, [text])[table].get(key) if equals else None
+        if not isinstance(values, list) or not values:
+            raise RecipeError(f"cannot vary {text!r}; write TABLE.KEY=[VALUE, VALUE], for example train.seed=[0, 1]")
+        choices[name] = values
+    found = []
+    for values in product(*choices.values()):
+        chosen = dict(zip(choices, values, strict=True))
+        tables = load_toml(recipe, TABLES)
+        for name, value in chosen.items():
+            table, _, key = name.partition(".")
+            tables.setdefault(table, {})[key] = value
+        build(TrainRecipe, tables.get("train", {}), f"{recipe} [train] with {chosen}")
+        build(EvalRecipe, tables.get("eval", {}), f"{recipe} [eval] with {chosen}")
+        found.append((chosen, tables))
+    return found
+
+
+def sweep(
+    recipe: Path,
+    varied: Sequence[str],
+    dataset: Path,
+    out: Path,
+    *,
+    cluster: UnitMap | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> list[dict[str, Any]]:
+    """Train and evaluate a policy for every combination of what is varied; each lands in a folder of `out`.
+
+    They are made one after the other, or each on a core of a `cluster`, with the same result for every episode.
+    Returns a row for each, the best first; `report.json` holds the same. Raises `RecipeError` for what cannot be
+    varied, `OutputError` when `out` exists.
+    """
+    made = combinations(recipe, varied)
+    check_output(out, overwrite=overwrite)
+    out.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    with progress("sweep", len(made)) as bar:
+        all_tables = [tables for _, tables in made]
+        if cluster is None:
+            results = ((index, _make(dataset, tables, EVERY_CORE)) for index, tables in enumerate(all_tables))
+        else:
+            results = cluster(_unit, packed(dataset), all_tables)
+        for index, (files, measured) in results:
+            chosen, folder = made[index][0], out / f"{index:03d}"
+            unpack(files, folder)
+            rows.append({"folder": folder.name, **chosen, **measured})
+            bar.advance(note=f"{chosen}: {measured['success_rate']:.0%}")
+    rows.sort(key=lambda row: (-row["success_rate"], row["folder"]))
+    write_json(out / REPORT, {"rows": rows})
+    parents = {str(dataset): sha256(dataset)}
+    write_manifest(
+        out, kind="sweep", recipe={**load_toml(recipe, TABLES), "varied": list(varied)}, parents=parents, seed=0
+    )
+    return rows
+
+
+def _unit(dataset: Mapping[str, bytes], tables: Tables) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """A worker's part of a sweep: one policy and its evaluation."""
+    with TemporaryDirectory() as folder:
+        unpack(dataset, Path(folder) / "dataset")
+        return _make(Path(folder) / "dataset", tables, 1)
+
+
+def _make(dataset: Path, tables: Tables, most_worlds: int) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """Train and evaluate one policy: the files of both, and what was measured."""
+    recipe = build(TrainRecipe, tables.get("train", {}), "[train]")
+    tried = build(EvalRecipe, tables.get("eval", {}), "[eval]")
+    with TemporaryDirectory() as folder:
+        policy, run = Path(folder) / "policy", Path(folder) / "run"
+        trained = train(dict(tables.get("policy", {})), recipe, dataset, policy, tables=tables)
+        report = evaluate(policy, tried, run, most_worlds=most_worlds)
+        measured = {
+            "success_rate": report.success_rate,
+            "interval": list(report.interval),
+            "episodes": report.episodes,
+            "mean_steps": report.mean_steps,
+            "loss": trained.loss,
+        }
+        return packed(Path(folder)), measured

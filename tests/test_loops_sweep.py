@@ -1,0 +1,48 @@
+import json
+
+import numpy as np
+import pytest
+
+from lfd.core.errors import RecipeError, UnknownName
+from lfd.loops.sweep import combinations, sweep
+from tests.conftest import BC
+
+
+@pytest.mark.slow
+def test_a_sweep_gives_the_same_policies_and_episodes_on_a_cluster(thread, tmp_path) -> None:
+    from lfd.cluster import connect
+
+    recipe = tmp_path / "recipe.toml"
+    text = BC.read_text().replace("steps = 6000", "steps = 20").replace("max_seconds = 10.0", "max_seconds = 1.0")
+    recipe.write_text(text)
+    varied = ["train.seed=[0, 1]", "eval.episodes=[2]"]
+    alone = sweep(recipe, varied, thread.dataset, tmp_path / "alone")
+    with connect("local") as cluster:
+        together = sweep(recipe, varied, thread.dataset, tmp_path / "ray", cluster=cluster)
+    assert alone == together
+    assert sorted(row["train.seed"] for row in alone) == [0, 1]
+    assert len({row["loss"] for row in alone}) == 2
+    for folder in ("000", "001"):
+        reports = [json.loads((tmp_path / p / folder / "run" / "report.json").read_text()) for p in ("alone", "ray")]
+        assert reports[0]["per_episode"] == reports[1]["per_episode"]
+        assert (tmp_path / "ray" / folder / "policy" / "model.safetensors").is_file()
+
+
+def test_all_combinations_are_made() -> None:
+    made = combinations(BC, ["train.seed=[0, 1]", "policy.hidden_sizes=[[8], [9, 9], [7]]"])
+    assert len(made) == 6
+    chosen, tables = made[4]
+    assert chosen == {"train.seed": 1, "policy.hidden_sizes": [9, 9]}
+    assert tables["train"]["seed"] == 1
+    assert tables["policy"]["hidden_sizes"] == [9, 9]
+    assert tables["train"]["steps"] == 6000
+    assert np.unique([str(c) for c, _ in made]).size == 6
+
+
+def test_what_cannot_be_varied_is_said_before_anything_is_trained() -> None:
+    with pytest.raises(RecipeError, match=r"cannot vary 'train.seed=3'; write TABLE.KEY=\[VALUE, VALUE\]"):
+        combinations(BC, ["train.seed=3"])
+    with pytest.raises(RecipeError, match="cannot vary 'train.seed'"):
+        combinations(BC, ["train.seed"])
+    with pytest.raises(UnknownName, match="'sed'.*seed"):
+        combinations(BC, ["train.sed=[1, 2]"])
