@@ -21,14 +21,16 @@ format: $(READY)
 
 results: $(READY)
 	$(BIN)/lfd demo --out outputs/demo --overwrite --results docs/results.md
-	$(BIN)/lfd bench sim --results docs/results.md
+	$(BIN)/lfd bench sim --full --results docs/results.md
+	$(BIN)/lfd bench cameras --results docs/results.md
 
 pictures: $(READY)
 	$(BIN)/python docs/make_pictures.py
 
-# What the pictures need beside Python, on Debian and Ubuntu: a software Vulkan driver for Rerun's viewer.
+# What cameras and pictures need beside Python, on Debian and Ubuntu: EGL with Mesa's CPU renderer, and a software Vulkan
+# driver for Rerun's viewer.
 system:
-	apt-get update -qq && apt-get install -y -qq mesa-vulkan-drivers
+	apt-get update -qq && apt-get install -y -qq libegl1 libgl1 libgl1-mesa-dri mesa-vulkan-drivers
 
 lock: $(READY)
 	$(UV) pip compile --quiet --no-emit-index-url --no-header --python-version 3.12 --extra dev pyproject.toml --output-file requirements.lock

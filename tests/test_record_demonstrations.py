@@ -1,3 +1,5 @@
+import os
+from ctypes.util import find_library
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +47,8 @@ def test_too_many_failures_end_the_recording_and_keep_the_successes(short, tmp_p
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory) -> Path:
     """One demonstration with two cameras, and the dataset made of it."""
+    if not (find_library("EGL") or find_library("OSMesa") or "CI" in os.environ):
+        pytest.skip("offscreen rendering needs a library that `make system` installs")
     from lfd.convert.to_lerobot import convert
 
     folder = tmp_path_factory.mktemp("filmed")
@@ -109,3 +113,12 @@ def test_a_camera_that_is_not_there_is_named_with_those_that_are(short, tmp_path
     ):
         record(replace(short, cameras=("agent",)), tmp_path / "out", tables={})
     assert not (tmp_path / "out").exists()
+
+
+def test_a_task_without_an_expert_loses_nothing(short, tmp_path) -> None:
+    out = tmp_path / "out"
+    record(replace(short, episodes=1, max_seconds=10.0), out, tables={})
+    before = sorted(out.iterdir())
+    with pytest.raises(UnknownName, match="unknown task of a scripted expert 'Stack'; known: Lift"):
+        record(replace(short, task="Stack"), out, tables={}, overwrite=True)
+    assert sorted(out.iterdir()) == before

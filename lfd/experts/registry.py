@@ -11,11 +11,16 @@ EXPERTS: dict[str, Callable[[WorldSpec], Policy]] = {
 }
 
 
+def check_expert(task: str) -> None:
+    """Raise `UnknownName` for a task that has no expert."""
+    if task not in EXPERTS:
+        raise UnknownName("task of a scripted expert", task, EXPERTS)
+
+
 def make_expert(spec: WorldSpec) -> Policy:
     """The expert for a world's task.
 
     Raises `UnknownName` for a task that has none.
     """
-    if spec.task not in EXPERTS:
-        raise UnknownName("task of a scripted expert", spec.task, EXPERTS)
+    check_expert(spec.task)
     return EXPERTS[spec.task](spec)

@@ -10,6 +10,7 @@ from lfd.core.artifact import check_output, packed, sha256, unpack, write_json, 
 from lfd.core.errors import RecipeError
 from lfd.core.protocols import Progress, UnitMap, silent
 from lfd.core.recipe import build, load_toml
+from lfd.data.frames import load_frames
 from lfd.run.evaluate import REPORT, EvalRecipe, evaluate
 from lfd.train.behavior_cloning import TrainRecipe, train
 from lfd.worlds.robosuite_world import EVERY_CORE
@@ -63,6 +64,7 @@ def sweep(
     """
     made = combinations(recipe, varied)
     check_output(out, overwrite=overwrite)
+    load_frames(dataset)  # one that cannot be used shows before anything is touched
     out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
     with progress("sweep", len(made)) as bar:

@@ -12,7 +12,7 @@ from lfd.core.errors import LfdError, RecipeError
 from lfd.core.protocols import Policy, Progress, UnitMap, World, batches, silent
 from lfd.core.recipe import as_table
 from lfd.experts.noise import NoisyPolicy
-from lfd.experts.registry import make_expert
+from lfd.experts.registry import check_expert, make_expert
 from lfd.record.episode_file import McapRecorder, Origin
 from lfd.record.mcap_file import SUFFIX
 from lfd.worlds.robosuite_world import EVERY_CORE, RobosuiteWorld, kept_world, make_worlds
@@ -98,7 +98,9 @@ def record(
     Raises `OutputError` when `out` holds something already, `LfdError` when too many attempts fail.
     """
     check_output(out, overwrite=overwrite)
-    robot = load_robot(recipe.robot)  # a name that is unknown shows before anything is touched
+    robot = load_robot(recipe.robot)  # names that are unknown show before anything is touched
+    load_task(recipe.task)
+    check_expert(recipe.task)
     if cluster is None:
         most = min(most_worlds, recipe.episodes)
         worlds = make_worlds(recipe.task, recipe.robot, recipe.control_hz, most=most, progress=progress)
@@ -106,7 +108,6 @@ def record(
             _take_cameras(world, recipe)
     else:
         worlds = []
-        load_task(recipe.task)
     out.mkdir(parents=True, exist_ok=True)
     for old in (*out.glob(f"*{SUFFIX}"), *out.glob(f"*{SUFFIX}.part")):
         old.unlink()
