@@ -154,6 +154,26 @@ def test_a_restored_state_has_the_same_future_bit_for_bit(lift_world, rng) -> No
                 np.testing.assert_array_equal(world.sim_state(), expected)
 
 
+@pytest.mark.parametrize("task", ["Door", "Wipe", "PickPlaceCan", "TwoArmTransport"])
+def test_a_state_can_go_to_another_world_with_all_that_a_reset_placed(task, rng) -> None:
+    from lfd.worlds.cameras import load_model
+
+    world, other = make_world(task, "panda", 20), make_world(task, "panda", 20)
+    actions = rng.uniform(-1, 1, (12, len(world.spec.action_low)))
+    for seed in (1, 2):
+        world.reset(np.random.default_rng(seed))
+        for action in actions[:4]:
+            world.step(action)
+        state = world.get_state()
+        np.testing.assert_allclose(load_model(state.model_xml).body_pos, world._model.body_pos, atol=0)
+        expected = [world.step(action).observation for action in actions[4:]]
+        seen = other.set_state(state)
+        for action, wanted in zip(actions[4:], expected, strict=True):
+            seen = other.step(action).observation
+            for name, values in wanted.items():
+                np.testing.assert_array_equal(seen[name], values, err_msg=name)
+
+
 def test_stages_start_from_different_states_for_the_same_seed(lift_world) -> None:
     lift_world.reset(episode_rng("record", 0, 0))
     demonstrated = lift_world.sim_state()

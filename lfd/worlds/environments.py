@@ -8,6 +8,8 @@ from typing import Any
 from lfd.worlds.robots import RobotConfig
 from lfd.worlds.tasks import Task
 
+PLACED = ("body_pos", "body_quat")
+"""Fields of the model that a reset changes: where robosuite places what cannot move, such as a door."""
 HOLLOW_MESHES = {"Sawyer": ("_head_1", "_head_4"), "Baxter": ("_H1_1",)}
 """Meshes too flat for the volume that MuJoCo >= 3.3 asks for; it computes their inertia as shells instead."""
 
@@ -19,7 +21,9 @@ def import_robosuite() -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SyntaxWarning)  # escape sequences in robosuite's docstrings
         import robosuite
+        from robosuite.environments.base import MujocoEnv
         from robosuite.models import robots
+    _remember_places(MujocoEnv)
     for robot, meshes in HOLLOW_MESHES.items():
         _make_hollow(getattr(robots, robot), meshes)
     return robosuite
@@ -49,6 +53,17 @@ def make_environment(task: Task, robot: RobotConfig, control_hz: int, **options:
         ignore_done=True,
         **(quiet | options),
     )
+
+
+def _remember_places(environment: Any) -> None:
+    """Let robosuite environments keep, as `places_in_xml`, the places that their present model was compiled with."""
+    initialize = environment._initialize_sim
+
+    def initialize_and_remember(self: Any, xml_string: str | None = None) -> None:
+        initialize(self, xml_string)
+        self.places_in_xml = {field: getattr(self.sim.model._model, field).copy() for field in PLACED}
+
+    environment._initialize_sim = initialize_and_remember
 
 
 def _make_hollow(robot: Any, meshes: tuple[str, ...]) -> None:

@@ -24,7 +24,7 @@ from lfd.core.errors import InputError, SimulationError
 from lfd.core.protocols import Observation, Progress, StepResult, WorldSpec, WorldState, silent
 from lfd.worlds.cameras import Cameras
 from lfd.worlds.drawn_sizes import draw_sizes
-from lfd.worlds.environments import make_environment
+from lfd.worlds.environments import PLACED, make_environment
 from lfd.worlds.observing import Sight
 from lfd.worlds.robots import CONTROLLERS, RobotConfig, load_robot
 from lfd.worlds.same_numbers import compare
@@ -33,8 +33,6 @@ from lfd.worlds.tasks import Task, load_task
 
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 UNSTABLE = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
-PLACED = ("body_pos", "body_quat")
-"""Fields of the model that a reset changes: where robosuite places what cannot move, such as a door."""
 EVERY_CORE = 2**16
 """As many worlds as there are cores."""
 logger = logging.getLogger(__name__)
@@ -201,7 +199,6 @@ class RobosuiteWorld:
         self._before = np.empty(mujoco.mj_stateSize(self._model, INTEGRATION))
         self._scratch = mujoco.MjData(self._model)
         self._warnings, self._unstable = self._data.warning.number, [int(kind) for kind in UNSTABLE]
-        self._compiled_places = {name: getattr(self._model, name).copy() for name in PLACED}
         self._sight = Sight(self._env, self._task)
         self._stepper = make_stepper(self._wanted, self._env)
 
@@ -245,19 +242,16 @@ class RobosuiteWorld:
 
     def _write_places(self) -> None:
         """Write where a reset placed what cannot move into the XML."""
-        moved = {
-            field: np.flatnonzero((getattr(self._model, field) != self._compiled_places[field]).any(axis=1))
-            for field in PLACED
-        }
-        if not any(len(bodies) for bodies in moved.values()):
-            return
-        elements: dict[str | None, ET.Element] = {e.get("name"): e for e in self._env.model.root.iter("body")}
-        for field, bodies in moved.items():
-            for body in bodies:
+        elements: dict[str | None, ET.Element] = {}
+        for field in PLACED:
+            places = getattr(self._model, field)
+            for body in np.flatnonzero((places != self._env.places_in_xml[field]).any(axis=1)):
+                elements = elements or {e.get("name"): e for e in self._env.model.root.iter("body")}
                 element = elements[self._model.body(body).name]
-                element.set(
-                    field.removeprefix("body_"), " ".join(repr(float(x)) for x in getattr(self._model, field)[body])
-                )
+                if field == "body_quat":
+                    for other in ("euler", "axisangle", "xyaxes", "zaxis"):
+                        element.attrib.pop(other, None)
+                element.set(field.removeprefix("body_"), " ".join(repr(float(x)) for x in places[body]))
 
     def _parts(self) -> dict[str, Any]:
         """What has a memory between control steps: the part controllers and the grippers."""
@@ -288,7 +282,7 @@ class RobosuiteWorld:
                 buffer = holder.derr_buf
                 kept[f"{part}.derr_buf"] = np.append(buffer.buf, [buffer.ptr, buffer._size])
         for field in PLACED:
-            if (getattr(self._model, field) != self._compiled_places[field]).any():
+            if (getattr(self._model, field) != self._env.places_in_xml[field]).any():
                 kept[f"model.{field}"] = getattr(self._model, field).copy()
         if hasattr(self._env, "wiped_markers"):
             wiped = {marker.name for marker in self._env.wiped_markers}
@@ -297,6 +291,8 @@ class RobosuiteWorld:
 
     def _set_memory(self, memory: Mapping[str, np.ndarray]) -> None:
         parts = self._parts()
+        for field in PLACED:
+            getattr(self._model, field)[:] = self._env.places_in_xml[field]
         for key, value in memory.items():
             part, _, name = key.rpartition(".")
             if part == "model":
