@@ -1,5 +1,6 @@
 """Same numbers: the compiled step against robosuite's own, for robots x controllers x tasks."""
 
+import gc
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -67,6 +68,8 @@ def compare_cases(cases: Sequence[Case], *, control_hz: int, steps: int, seed: i
             1.2 * world.spec.action_low, 1.2 * world.spec.action_high, (steps, len(world.spec.action_low))
         )
         yield Row((task, robot, controller), compare(world, list(actions)))
+        del world
+        gc.collect()  # a world is a ring of references to much memory that Python does not count
 
 
 def bench_matrix(

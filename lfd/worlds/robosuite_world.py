@@ -281,9 +281,9 @@ class RobosuiteWorld:
             if hasattr(holder, "derr_buf"):
                 buffer = holder.derr_buf
                 kept[f"{part}.derr_buf"] = np.append(buffer.buf, [buffer.ptr, buffer._size])
-        for field in PLACED:
-            if (getattr(self._model, field) != self._env.places_in_xml[field]).any():
-                kept[f"model.{field}"] = getattr(self._model, field).copy()
+        for field, compiled in self._env.places_in_xml.items():
+            if (getattr(self._model, field) != compiled).any():
+                kept[f"model.{field}"], kept[f"compiled.{field}"] = getattr(self._model, field).copy(), compiled
         if hasattr(self._env, "wiped_markers"):
             wiped = {marker.name for marker in self._env.wiped_markers}
             kept["task.wiped"] = np.array([float(m.name in wiped) for m in self._env.model.mujoco_arena.markers])
@@ -291,13 +291,12 @@ class RobosuiteWorld:
 
     def _set_memory(self, memory: Mapping[str, np.ndarray]) -> None:
         parts = self._parts()
-        for field in PLACED:
-            getattr(self._model, field)[:] = self._env.places_in_xml[field]
+        self._place(memory)
         for key, value in memory.items():
             part, _, name = key.rpartition(".")
-            if part == "model":
-                getattr(self._model, name)[:] = value
-            elif part == "task":
+            if part in ("model", "compiled"):
+                continue
+            if part == "task":
                 self._wipe(value)
             elif name == "derr_buf":
                 buffer = parts[part].derr_buf
@@ -307,6 +306,22 @@ class RobosuiteWorld:
                 )
             else:
                 setattr(parts[part], name, bool(value) if name in FLAGS else np.array(value))
+
+    def _place(self, memory: Mapping[str, np.ndarray]) -> None:
+        """Put what cannot move where it was, in a model whose constants are those of the places it was compiled with.
+
+        Those of a model that was compiled from the XML of a state belong to where the reset placed things: equal but
+        for rounding, which contacts would amplify.
+        """
+        was = self._env.places_in_xml
+        compiled = {field: memory.get(f"compiled.{field}", was[field]) for field in PLACED}
+        for field in PLACED:
+            getattr(self._model, field)[:] = compiled[field]
+        if any((compiled[field] != was[field]).any() for field in PLACED):
+            mujoco.mj_setConst(self._model, self._scratch)
+            self._env.places_in_xml = {field: np.array(compiled[field]) for field in PLACED}
+        for field in PLACED:
+            getattr(self._model, field)[:] = memory.get(f"model.{field}", compiled[field])
 
     def _wipe(self, wiped: np.ndarray) -> None:
         """Make the marked dirt of the Wipe task wiped, and the rest not."""
