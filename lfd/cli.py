@@ -47,7 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"lfd {arguments.name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        kept = {"record": "finished episodes are kept", "demo": "finished stages are kept"}
+        kept = {
+            "record": "finished episodes are kept",
+            "demo": "finished stages are kept",
+            "sweep": "finished policies are kept",
+        }
         print(
             f"\nlfd {arguments.name}: interrupted; {kept.get(arguments.name, 'nothing was written')}", file=sys.stderr
         )

@@ -1,6 +1,6 @@
 """One control step as a single compiled function.
 
-robosuite computes the torques of every physics substep in Python, which takes nine tenths of a control step.
+robosuite computes the torques of every physics substep in Python, which takes most of a control step.
 Here the loop
 
     repeat: torques of every arm's controller -> mj_step2 -> mj_step1

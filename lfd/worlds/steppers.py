@@ -238,7 +238,7 @@ def _moved(gripper: Any, position: np.ndarray, action: float) -> np.ndarray:
 
 
 def _moves_by_sign(gripper: Any, fingers: int) -> bool:
-    """Whether a gripper moves as `compiled_step.Grippers` says; robosuite's dexterous hands do not."""
+    """Whether a gripper moves as `compiled_step.GRIPPER` says; robosuite's dexterous hands do not."""
     if gripper.dof != 1:
         return False
     still = np.zeros(fingers)
