@@ -14,7 +14,9 @@ def test_the_sim_bench_answers_with_its_ratios() -> None:
     rates, resets, ratios = found["steps_per_second"], found["reset_seconds"], found["ratios"]
     assert found["stepper"] == "compiled"
     assert found["control_steps"] == 80
-    assert {"one_core_vs_robosuite", "one_core_vs_physics_limit", "two_threads_vs_one", "reset_vs_robosuite"} <= set(ratios)
+    assert {"one_core_vs_robosuite", "one_core_vs_physics_limit", "two_threads_vs_one", "reset_vs_robosuite"} <= set(
+        ratios
+    )
     ours = rates["ours, one core"]
     assert ratios["one_core_vs_robosuite"] == pytest.approx(ours / rates["robosuite"], rel=0.01)
     assert ratios["one_core_vs_physics_limit"] == pytest.approx(ours / rates["physics alone"], rel=0.01)

@@ -31,8 +31,8 @@ STATE, EVERYTHING = mujoco.mjtState.mjSTATE_INTEGRATION, mujoco.mjtCatBit.mjCAT_
 SMALL = 128 * 128
 """Up to here [pixels] edges are antialiased. Above, that would cost Mesa's CPU renderer more than everything else,
 and edges are a smaller part of the picture."""
-CELLS, FINEST, COARSEST = 30, 0.004, 0.030
-"""A mesh's grid has its diagonal's 1/30 for a cell, within 4 and 30 mm."""
+CELLS, FINEST, COARSEST = (45, 80), 0.003, 0.030
+"""A mesh's grid has its diagonal's 1/45 for a cell, in large pictures its 1/80, within 3 and 30 mm."""
 COLLISION, LEFT_OUT = 0, 5
 """Geom groups that are not drawn: robosuite's for collision geoms, and ours for what the picture does not show."""
 CORNERS = np.array(list(product((-1, 1), repeat=3)))
@@ -128,7 +128,7 @@ class Cameras:
         # cylinders of 28 slices and 16 rings make a table's legs as dear as the robot; these are off by 1% of a radius
         model.vis.quality.numslices, model.vis.quality.numstacks = 20, 8
         for mesh in range(model.nmesh):
-            _simplify_in_place(model, mesh)
+            _simplify_in_place(model, mesh, CELLS[height * width > SMALL])
 
     def _draw(self, camera: int) -> UInt8[np.ndarray, "H W 3"]:
         self._leave_out(camera)
@@ -252,11 +252,11 @@ def _numbered(rows: Int[np.ndarray, "N 3"]) -> Int[np.ndarray, "N"]:
     return (rows[:, 0] * y + rows[:, 1]) * z + rows[:, 2]
 
 
-def _simplify_in_place(model: mujoco.MjModel, mesh: int) -> None:
+def _simplify_in_place(model: mujoco.MjModel, mesh: int, cells: int) -> None:
     """Corners keep their normals and texture coordinates, so that shading stays that of the fine mesh."""
     begin, number = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
     points = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
-    cell = np.clip(np.linalg.norm(np.ptp(points, axis=0)) / CELLS, FINEST, COARSEST)
+    cell = np.clip(np.linalg.norm(np.ptp(points, axis=0)) / cells, FINEST, COARSEST)
     moved, faces, kept = simplify(points, model.mesh_face[begin : begin + number], float(cell))
     points[: len(moved)] = moved
     model.mesh_face[begin : begin + len(kept)] = faces
