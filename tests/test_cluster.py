@@ -202,7 +202,8 @@ def test_an_evaluation_that_loses_a_node_is_the_same_episode_for_episode(two_nod
     from lfd import evaluate, read_episode
     from lfd.run.evaluate import EvalRecipe
 
-    recipe = EvalRecipe(episodes=12, seed=5, max_seconds=2.0, hold_seconds=0.5)
+    # barely trained, it fails: three episodes to a unit, which takes about a second, and two units wait for a core
+    recipe = EvalRecipe(episodes=24, seed=5, max_seconds=20.0, hold_seconds=0.5)
     (victim,) = two_nodes.worker_nodes
     raylet = victim.all_processes["raylet"][0].process.pid
 
@@ -212,6 +213,7 @@ def test_an_evaluation_that_loses_a_node_is_the_same_episode_for_episode(two_nod
         def advance(self, amount: int = 1, note: str = "") -> None:
             if not self.killed:
                 self.killed = True
+                time.sleep(0.2)  # by now the node is at work on the next of its units
                 for process in [raylet, *descendants(raylet)]:
                     os.kill(process, signal.SIGKILL)
 
