@@ -1,8 +1,10 @@
+import resource
+import signal
 from pathlib import Path
 
 import pytest
 
-from lfd.core.artifact import new_folder, read_manifest, sha256, write_manifest
+from lfd.core.artifact import new_folder, packed, read_manifest, sha256, unpack, write_manifest
 from lfd.core.errors import OutputError
 
 
@@ -55,3 +57,26 @@ def test_the_hash_of_a_folder_is_of_names_and_content(tmp_path: Path) -> None:
     assert sha256(tmp_path) == first
     (tmp_path / "a").rename(tmp_path / "b")
     assert sha256(tmp_path) != first
+
+
+def test_a_folder_survives_the_way_to_another_machine(tmp_path: Path) -> None:
+    here, there = tmp_path / "here", tmp_path / "there"
+    (here / "deep").mkdir(parents=True)
+    (here / "deep" / "weights").write_bytes(b"\x00\x01")
+    (here / "config.json").write_text("{}")
+    unpack(packed(here), there)
+    assert sha256(there) == sha256(here)
+
+
+def test_files_that_cannot_be_written_get_a_sentence_and_leave_nothing_half_written(tmp_path: Path) -> None:
+    """A limit on the size of files stands for a full disk."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limit[1]))
+    try:
+        with pytest.raises(OutputError, match=r"cannot write .*large: File too large; choose another --out"):
+            unpack({"a_small": b"x", "large": bytes(2000)}, tmp_path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+        signal.signal(signal.SIGXFSZ, before)
+    assert [path.name for path in tmp_path.iterdir()] == ["a_small"]

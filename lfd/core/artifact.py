@@ -148,8 +148,17 @@ def packed(folder: Path) -> dict[str, bytes]:
 
 
 def unpack(files: Mapping[str, bytes], folder: Path) -> None:
-    """Write what `packed` gave into a folder."""
+    """Write what `packed` gave into a folder; each file appears under its name when it is whole.
+
+    Raises `OutputError` when the disk is full or the folder cannot be written; what was finished before stays.
+    """
     for name, content in files.items():
         path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        part = path.with_name(path.name + ".part")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_bytes(content)
+            part.replace(path)
+        except OSError as error:
+            part.unlink(missing_ok=True)
+            raise OutputError(f"cannot write {path}: {error.strerror}; choose another --out") from error

@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from lfd.core.errors import SimulationError, UnknownName
+from lfd.worlds import step_records as records
 
 MUJOCO = "3.3.7"
 """The version whose C functions the compiled step calls; another one's signatures could crash the process."""
-MOST_JOINTS = 8
-"""Of an arm; `compiled_step.JOINTS`, which is not imported here because it loads the compiler."""
 OSC_NAMES = ("OSC_POSE", "OSC_POSITION")
 JOINT_NAMES = ("JOINT_POSITION", "JOINT_VELOCITY", "JOINT_TORQUE")
 
@@ -70,24 +69,24 @@ class CompiledStepper:
     name = "compiled"
 
     def __init__(self, env: Any):
-        from lfd.worlds import compiled_step as c
+        from lfd.worlds.compiled_step import control_step  # loads the compiler
 
         reason = uncovered(env)
         if reason:
             raise SimulationError(f"the compiled step does not cover {reason}")
-        self._env, self._control_step = env, c.control_step
+        self._env, self._control_step = env, control_step
         model, data = env.sim.model._model, env.sim.data._data
-        self._physics = c.Physics(
+        self._physics = records.Physics(
             model=model._address,
             data=data._address,
             jac_pos=np.zeros((3, model.nv)),
             jac_rot=np.zeros((3, model.nv)),
-            **{name: getattr(data, name) for name in c.Physics._fields[2:-2]},
+            **{name: getattr(data, name) for name in records.Physics._fields[2:-2]},
         )
         arms = list(arms_of(env))
-        self._arms = _records(c.ARM, [_arm(env, robot, arm) for robot, arm in arms])
-        self._grippers = _records(c.GRIPPER, [_gripper(env, robot, arm) for robot, arm in arms])
-        self._memory, self._scratch = np.zeros(len(arms), c.MEMORY), np.zeros(1, c.SCRATCH)
+        self._arms = _records(records.ARM, [_arm(env, robot, arm) for robot, arm in arms])
+        self._grippers = _records(records.GRIPPER, [_gripper(env, robot, arm) for robot, arm in arms])
+        self._memory, self._scratch = np.zeros(len(arms), records.MEMORY), np.zeros(1, records.SCRATCH)
         self._substeps = int(env.control_timestep / env.model_timestep)
         self.load()
 
@@ -168,9 +167,7 @@ def action_start(env: Any, robot: Any, part: str) -> int:
 
 
 def _arm(env: Any, robot: Any, arm: str) -> dict[str, Any]:
-    """One arm's record, `compiled_step.ARM`."""
-    from lfd.worlds import compiled_step as c
-
+    """One arm's record, `step_records.ARM`."""
     part, model = robot.composite_controller.part_controllers[arm], env.sim.model._model
     part.scale_action(np.zeros(part.control_dim))  # fills in its scale
     actuators = np.array(robot._ref_actuators_indexes_dict[arm])
@@ -199,7 +196,7 @@ def _arm(env: Any, robot: Any, arm: str) -> dict[str, Any]:
         "output_middle": part.action_output_transform,
         "goal_low": goal_low,
         "goal_high": goal_high,
-        "kind": c.OSC if osc else 1 + JOINT_NAMES.index(part.name),
+        "kind": records.OSC if osc else 1 + JOINT_NAMES.index(part.name),
         "joints": n,
         "site": env.sim.model.site_name2id(part.ref_name),
         "action_at": action_start(env, robot, arm),
@@ -212,7 +209,7 @@ def _arm(env: Any, robot: Any, arm: str) -> dict[str, Any]:
 
 
 def _gripper(env: Any, robot: Any, arm: str) -> dict[str, Any]:
-    """One gripper's record, `compiled_step.GRIPPER`; without fingers where the arm has none."""
+    """One gripper's record, `step_records.GRIPPER`; without fingers where the arm has none."""
     gripper, model = robot.gripper[arm], env.sim.model._model
     if not gripper.dof:
         return {"fingers": 0}
@@ -238,7 +235,7 @@ def _moved(gripper: Any, position: np.ndarray, action: float) -> np.ndarray:
 
 
 def _moves_by_sign(gripper: Any, fingers: int) -> bool:
-    """Whether a gripper moves as `compiled_step.GRIPPER` says; robosuite's dexterous hands do not."""
+    """Whether a gripper moves as `step_records.GRIPPER` says; robosuite's dexterous hands do not."""
     if gripper.dof != 1:
         return False
     still = np.zeros(fingers)
@@ -297,7 +294,7 @@ def uncovered(env: Any) -> str:
 def _uncovered_arm(part: Any) -> str:
     if part.name not in OSC_NAMES + JOINT_NAMES:
         return f"the controller {part.name}"
-    if part.joint_dim > MOST_JOINTS:
+    if part.joint_dim > records.JOINTS:
         return f"an arm of {part.joint_dim} joints"
     if any(getattr(part, name, None) is not None for name in ("interpolator", "interpolator_pos", "interpolator_ori")):
         return "interpolators"

@@ -1,0 +1,251 @@
+"""What each command of the command line does: from its arguments to the result that is shown.
+
+Every command imports its stage when it runs, so that `lfd --help` answers at once.
+"""
+
+import sys
+from argparse import Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from typing import Any
+
+Result = dict[str, Any]
+
+
+def run_record(given: Namespace) -> Result:
+    """Demonstrations of a task."""
+    from lfd.core.recipe import build, load_toml
+    from lfd.record.demonstrations import RecordRecipe, record
+    from lfd.terminal import progress_bar
+
+    tables = load_toml(given.recipe, ("record", "convert"), given.set)
+    _put(tables, "record", episodes=given.episodes, seed=given.seed)
+    recipe = build(RecordRecipe, tables.get("record", {}), f"{given.recipe} [record]")
+    with _machines(given.cluster) as cluster:
+        done = record(
+            recipe,
+            given.out,
+            tables=tables,
+            most_worlds=given.worlds,
+            cluster=cluster,
+            overwrite=given.overwrite,
+            progress=progress_bar,
+        )
+    return {"out": str(given.out), **asdict(done)}
+
+
+def run_convert(given: Namespace) -> Result:
+    """A dataset from recordings."""
+    from lfd.convert.features import ConvertRecipe
+    from lfd.convert.to_lerobot import convert
+    from lfd.core.recipe import build, load_toml
+    from lfd.terminal import progress_bar
+
+    recipe = None
+    if given.recipe is not None:
+        table = load_toml(given.recipe, ("record", "convert")).get("convert", {})
+        recipe = build(ConvertRecipe, table, f"{given.recipe} [convert]")
+    done = convert(given.sources, given.out, recipe=recipe, overwrite=given.overwrite, progress=progress_bar)
+    return {"out": str(given.out), **asdict(done)}
+
+
+def run_train(given: Namespace) -> Result:
+    """A policy from a dataset."""
+    from lfd.core.recipe import build, load_toml
+    from lfd.run.evaluate import EvalRecipe
+    from lfd.terminal import progress_bar
+    from lfd.train.behavior_cloning import TrainRecipe, train
+
+    tables = load_toml(given.recipe, ("policy", "train", "eval"), given.set)
+    _put(tables, "train", steps=given.steps, seed=given.seed)
+    recipe = build(TrainRecipe, tables.get("train", {}), f"{given.recipe} [train]")
+    build(EvalRecipe, tables.get("eval", {}), f"{given.recipe} [eval]")  # a mistake in it shows before training
+    done = train(
+        tables.get("policy", {}),
+        recipe,
+        given.dataset,
+        given.out,
+        tables=tables,
+        overwrite=given.overwrite,
+        progress=progress_bar,
+    )
+    return {"out": str(given.out), **asdict(done)}
+
+
+def run_evaluate(given: Namespace) -> Result:
+    """How often a policy succeeds."""
+    from lfd.core.recipe import build
+    from lfd.policies.acting import about_policy
+    from lfd.run.evaluate import EvalRecipe, evaluate
+    from lfd.terminal import progress_bar
+
+    tables = about_policy(given.policy)["recipe"]
+    _put(tables, "eval", episodes=given.episodes, seed=given.seed)
+    recipe = build(EvalRecipe, tables["eval"], f"{given.policy} [eval]")
+    with _machines(given.cluster) as cluster:
+        done = evaluate(
+            given.policy,
+            recipe,
+            given.out,
+            most_worlds=given.worlds,
+            cluster=cluster,
+            overwrite=given.overwrite,
+            progress=progress_bar,
+        )
+    report = asdict(done)
+    del report["per_episode"]
+    return {"out": str(given.out), **report}
+
+
+def run_sweep(given: Namespace) -> Result:
+    """Policies for every combination of some values."""
+    from lfd.loops.sweep import sweep
+    from lfd.terminal import progress_bar
+
+    with _machines(given.cluster) as cluster:
+        rows = sweep(
+            given.recipe,
+            given.vary,
+            given.dataset,
+            given.out,
+            cluster=cluster,
+            overwrite=given.overwrite,
+            progress=progress_bar,
+        )
+    if given.json:
+        return {"out": str(given.out), "rows": rows}
+    best = {row.pop("folder"): ", ".join(f"{k} {_short(v)}" for k, v in row.items()) for row in rows}
+    return {"out": str(given.out), **best}
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_short, value)) + "]"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def run_replay(given: Namespace) -> Result:
+    """An episode in Rerun, or its exact replay."""
+    from lfd.replay.clip import clip_of
+    from lfd.replay.rerun_scene import replay
+    from lfd.replay.verify import verify_replay
+
+    if given.verify:
+        found = asdict(verify_replay(given.source, given.episode))
+        found["failed"] = found["deviation"] > 0
+        return found
+    clip = clip_of(given.source, given.episode)
+    replay(clip, save=given.save, overwrite=given.overwrite)
+    shown = {"saved": str(given.save), "bytes": given.save.stat().st_size} if given.save else {"viewer": "opened"}
+    return {"episode": clip.title, "seconds": float(clip.times[-1]), **shown}
+
+
+def run_info(given: Namespace) -> Result:
+    """What a file or folder holds."""
+    from lfd.about import about
+
+    return about(given.path)
+
+
+def run_doctor(given: Namespace) -> Result:
+    """What of this machine works."""
+    del given
+    from lfd.doctor import examine
+
+    checks = examine()
+    marks = {c.name: f"{'ok' if c.works else 'BROKEN' if c.needed else 'no'}: {c.detail}" for c in checks}
+    return {**marks, "failed": any(c.needed and not c.works for c in checks)}
+
+
+def run_demo(given: Namespace) -> Result:
+    """The whole thread at once."""
+    from lfd.loops.demo import demo, rows_of
+    from lfd.loops.results import write_section
+    from lfd.terminal import progress_bar
+
+    recipes = given.dataset_recipe, given.policy_recipe
+    measured = demo(*recipes, given.out, overwrite=given.overwrite, progress=progress_bar)
+    if given.results is not None:
+        write_section(given.results, "The thread on Lift with a Panda", "lfd demo", rows_of(measured))
+    return measured if given.json else dict(rows_of(measured))
+
+
+def run_bench(given: Namespace) -> Result:
+    """Speed, side by side."""
+    from lfd.loops.results import write_section
+
+    measured, sections = _bench_sim(given) if given.suite == "sim" else _bench_cameras(given)
+    if given.results is not None:
+        command = f"lfd bench {given.suite}" + " --quick" * given.quick + " --full" * given.full
+        for title, rows in sections.items():
+            write_section(given.results, title, command, rows)
+    return measured
+
+
+def _bench_cameras(given: Namespace) -> tuple[Result, Result]:
+    from lfd.bench.cameras import bench_cameras
+    from lfd.terminal import progress_bar
+
+    measured = asdict(
+        bench_cameras(
+            task=given.task,
+            robot=given.robot,
+            control_hz=20,
+            cameras=("agentview", "robot0_eye_in_hand"),
+            sizes=(84, 256),
+            states=10 if given.quick else 40,
+            seed=given.seed,
+            progress=progress_bar,
+        )
+    )
+    rows = measured["ratios"] | {"mean difference [1/255]": measured["mean_difference"]}
+    rows |= {f"frames/s, {name}": rate for name, rate in measured["frames_per_second"].items()}
+    return measured, {f"Cameras: {given.task} with {given.robot}": rows}
+
+
+def _bench_sim(given: Namespace) -> tuple[Result, Result]:
+    from lfd.bench.matrix import bench_matrix, success_rates, whole_matrix
+    from lfd.bench.sim import bench_everywhere, bench_sim
+    from lfd.terminal import progress_bar
+
+    common: dict[str, Any] = {"control_hz": 20, "seed": given.seed, "progress": progress_bar}
+    episodes = 2 if given.quick else 20
+    measured = asdict(bench_sim(task=given.task, robot=given.robot, episodes=episodes, **common))
+    sections = {
+        f"Simulation: {given.task} with {given.robot}": measured["ratios"]
+        | {f"steps/s, {name}": rate for name, rate in measured["steps_per_second"].items()}
+    }
+    if given.full:
+        measured["everywhere"] = bench_everywhere(**common)
+        measured["matrix"] = asdict(bench_matrix(whole_matrix(), steps=10, **common))
+        rates = success_rates(task="Lift", robot="panda", episodes=100, **common)
+        measured["success"] = rates
+        said = {
+            name: f"{won} of 100, 95% interval {low:.1%} to {high:.1%}" for name, (won, (low, high)) in rates.items()
+        }
+        sections["Simulation: success of a noisy expert on both steppers"] = said
+        sections["Simulation: every task with a Panda, every robot on Lift"] = {
+            pair: ", ".join(f"{name} {value}" for name, value in ratios.items())
+            for pair, ratios in measured["everywhere"].items()
+        }
+        sections["Simulation: same numbers as robosuite, every robot x controller x task"] = measured["matrix"]
+    return measured, sections
+
+
+@contextmanager
+def _machines(address: str | None) -> Iterator[Any]:
+    """The cluster that was asked for, or none."""
+    if address is None:
+        yield None
+        return
+    from lfd.cluster import connect
+
+    with connect(address) as cluster:
+        print(f"{cluster.cpus} cores in the Ray cluster {address}", file=sys.stderr)
+        yield cluster
+
+
+def _put(tables: dict[str, dict[str, Any]], table: str, **values: Any) -> None:
+    """Put the options that were given over the recipe's keys."""
+    tables.setdefault(table, {}).update({key: value for key, value in values.items() if value is not None})
