@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -89,6 +90,15 @@ class World(Protocol):
         ...
 
 
+class Verdict(StrEnum):
+    """A person's word that ends an episode."""
+
+    SUCCESS = "success"
+    FAILURE = "failure"
+    DISCARD = "discard"
+    """Not even a failure to keep."""
+
+
 @dataclass(frozen=True)
 class Decision:
     """What a policy chose, and what is known about the choice."""
@@ -99,6 +109,10 @@ class Decision:
     """The expert's proposal in the same state, where one was asked; it may differ from `action`."""
     intervention: bool = False
     """Whether a person or expert overruled the policy."""
+    verdict: Verdict | None = None
+    """A word that ends the episode after this step."""
+    signals: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """What else belongs on record: channel name (`lfd.core.channels`) to its components."""
 
 
 @runtime_checkable

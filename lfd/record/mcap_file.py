@@ -104,11 +104,29 @@ class McapWriter:
 
 
 @dataclass(frozen=True)
+class Topic:
+    """What a file says of the messages on a topic."""
+
+    encoding: str
+    """Of the messages: cdr, json, protobuf."""
+    schema: str
+    """Name of the message type, for example sensor_msgs/msg/JointState; empty where there is none."""
+    schema_encoding: str
+    """Of the definition: ros2msg, jsonschema, protobuf."""
+    definition: bytes
+    """The message type's definition."""
+    about: Mapping[str, str]
+    """The channel's metadata; in our recordings unit and frame."""
+
+
+@dataclass(frozen=True)
 class McapContent:
     """Everything in a file, as bytes."""
 
     messages: Mapping[str, list[tuple[int, bytes]]]
     """Topic to (log time [ns], data), in the order of time."""
+    topics: Mapping[str, Topic]
+    """Topic to what the file says of it; also of topics without a message."""
     metadata: Mapping[str, Mapping[str, str]]
     attachments: Mapping[str, bytes]
 
@@ -121,10 +139,14 @@ def read_mcap(path: Path) -> McapContent:
     if not path.is_file():
         raise RecordingError(f"no recording {path}")
     messages: dict[str, list[tuple[int, bytes]]] = {}
+    topics: dict[str, Topic] = {}
     try:
         with path.open("rb") as stream:
             reader = make_reader(stream, validate_crcs=True)
-            for _, channel, message in reader.iter_messages():
+            for schema, channel, message in reader.iter_messages():
+                if channel.topic not in topics:
+                    told = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
+                    topics[channel.topic] = Topic(channel.message_encoding, *told, channel.metadata)
                 messages.setdefault(channel.topic, []).append((message.log_time, message.data))
             metadata = {record.name: record.metadata for record in reader.iter_metadata()}
             attachments = {record.name: record.data for record in reader.iter_attachments()}
@@ -133,4 +155,4 @@ def read_mcap(path: Path) -> McapContent:
         raise RecordingError(
             f"{path} is truncated, damaged or no MCAP file ({reason}); record the episode again or leave the file out"
         ) from error
-    return McapContent(messages, metadata, attachments)
+    return McapContent(messages, topics, metadata, attachments)

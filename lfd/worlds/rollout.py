@@ -11,7 +11,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lfd.core.protocols import BatchPolicy, Decision, Observation, Observer, Policy, Transition, World, WorldState
+from lfd.core.protocols import (
+    BatchPolicy,
+    Decision,
+    Observation,
+    Observer,
+    Policy,
+    Transition,
+    Verdict,
+    World,
+    WorldState,
+)
 
 STAGES = ("record", "eval")
 
@@ -87,15 +97,18 @@ class _Episode:
                 observer.begin(self.world, self.observation)
         result = self.world.step(decision.action)
         self._held = self._held + 1 if result.success else 0
-        solved = self._held >= self._hold_steps and not result.failure
-        done = bool(result.failure) or solved or was.steps + 1 == self._horizon
+        held = self._held >= self._hold_steps and decision.verdict is None
+        solved = (held or decision.verdict is Verdict.SUCCESS) and not result.failure
+        done = bool(result.failure or decision.verdict) or solved or was.steps + 1 == self._horizon
         for observer in self.start.observers:
             observer.step(self.world, Transition(was.steps, self.observation, decision, result, done))
         self.outcome = Outcome(
             was.steps + 1, solved, was.reward + result.reward, was.clipped + result.clipped, result.failure
         )
         self.observation = result.observation
-        if done:
+        if decision.verdict is Verdict.DISCARD:
+            self.abort()
+        elif done:
             for observer in self.start.observers:
                 observer.end(solved)
         return done
@@ -116,8 +129,8 @@ def rollouts(
     """Run episodes in parallel, each handed out when it ends.
 
     A world that is free asks `next_start` for an episode; none means none at the moment. An episode begins at its
-    start state, and ends when the task has been solved for `hold_steps` steps in a row (its success), when the
-    physics becomes unstable, or after `horizon` steps. Observers are called from the thread that steps their
+    start state, and ends when the task has been solved for `hold_steps` steps in a row (its success), at a person's
+    verdict, when the physics becomes unstable, or after `horizon` steps. Observers are called from the thread that steps their
     world. The policy is asked once for all worlds.
     """
     running: dict[int, _Episode] = {}
