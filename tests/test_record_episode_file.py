@@ -11,8 +11,10 @@ from lfd.core.channels import channel
 from lfd.core.errors import EpisodeError, OutputError, RecordingError
 from lfd.core.protocols import Decision
 from lfd.experts.playback import PlaybackPolicy
-from lfd.record import cdr, mcap_file
+from lfd.record import cdr
 from lfd.record.episode_file import McapRecorder, Origin, read_episode, recordings_in
+from lfd.record.mcap_file import read_mcap
+from lfd.record.mcap_writing import McapWriter
 from lfd.worlds.rollout import rollout
 
 ORIGIN = Origin(stage="record", policy="test", seed=1, index=2, recipe={})
@@ -178,8 +180,8 @@ def test_an_mcap_file_of_another_schema_is_refused(tmp_path) -> None:
 
 def rewrite(path: Path, topic: str, row: int, data: bytes | None) -> None:
     """The recording with one message replaced, or left out."""
-    content = mcap_file.read_mcap(path)
-    writer = mcap_file.McapWriter(path)
+    content = read_mcap(path)
+    writer = McapWriter(path)
     for name in ("joint_pos", "ee_pos", "cube_pos", "action", "reward", "sim_state"):
         written = channel(name).topic
         writer.channel(written, channel(name).schema, {})

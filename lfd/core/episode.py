@@ -45,6 +45,8 @@ class EpisodeMetadata:
     """Versions of the libraries and of the Python that made it."""
     recipe: Mapping[str, Any]
     """The recipe as it was used."""
+    recovered: str = ""
+    """How much of the episode was saved, where its recording was cut off; else empty."""
 
 
 @dataclass(frozen=True, kw_only=True)

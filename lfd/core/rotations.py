@@ -4,10 +4,10 @@ ROS messages and robosuite use xyzw; adapters convert with the two functions bel
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 
-def xyzw_from_wxyz(quat: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
+def xyzw_from_wxyz(quat: Shaped[np.ndarray, "*batch 4"]) -> Shaped[np.ndarray, "*batch 4"]:
     """Quaternion with the scalar moved to the end."""
     return np.roll(quat, -1, axis=-1)
 

@@ -18,15 +18,17 @@ from lfd.core.artifact import versions
 from lfd.core.channels import ARRAY, CHANNELS, IMAGE, JOINT_STATE, POSE, channel
 from lfd.core.episode import Episode, EpisodeMetadata
 from lfd.core.errors import EpisodeError, RecordingError
-from lfd.core.protocols import Observation, Transition, World
-from lfd.core.rotations import wxyz_from_xyzw, xyzw_from_wxyz
+from lfd.core.protocols import Decision, Observation, Transition, World, WorldState
+from lfd.core.rotations import wxyz_from_xyzw
 from lfd.record import cdr
-from lfd.record.mcap_file import DAMAGE, SUFFIX, McapContent, McapWriter, read_mcap
+from lfd.record.columns import arrays, joint_states, poses
+from lfd.record.layouts import BlockMessage, StepBlock
+from lfd.record.mcap_file import DAMAGE, SUFFIX, McapContent, read_mcap
+from lfd.record.mcap_writing import McapWriter
+from lfd.record.messages import Labels, step_messages
 from lfd.record.png import encode_png
 
 FORMAT = "1"
-STEP_LABELS = ("reward", "success", "done", "intervention")
-JOINT_KINDS = ("joint", "gripper")
 BEGIN, END = "lfd.episode", "lfd.episode_end"
 CAMERAS = CHANNELS["{camera}_picture"].topic.removesuffix("{camera}")
 MODEL, MEMORY = "model.xml", "controller_memory.json"
@@ -57,11 +59,8 @@ class McapRecorder:
         spec, origin = world.spec, self._origin
         self._writer = McapWriter(self._path)
         self._labels, self._hz = spec.labels, spec.control_hz
-        self._rows = {name: channel(name) for name in spec.labels if name != "action"}
         self._topics = {name: channel(f"{name}_picture").topic for name in spec.cameras}
-        names = spec.labels["action"]
-        self._grip_at = [at for at, name in enumerate(names) if name.endswith("gripper")]
-        self._grips = [names[at] for at in self._grip_at]
+        self._steps, self._reward, self._failure = 0, 0.0, ""
         self._start_ns = time.time_ns()
         about = EpisodeMetadata(
             task=spec.task,
@@ -78,32 +77,40 @@ class McapRecorder:
             versions=versions(),
             recipe=origin.recipe,
         )
-        texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in asdict(about).items()}
-        self._writer.metadata(BEGIN, texts | {"format": FORMAT, "labels": json.dumps(self._labels)})
         state = world.get_state()
-        memory = {key: value.tolist() for key, value in state.memory.items()}
-        self._writer.attachment(MODEL, "application/xml", state.model_xml.encode(), self._start_ns)
-        self._writer.attachment(MEMORY, "application/json", json.dumps(memory).encode(), self._start_ns)
-        self._announce()
+        self._observed = [name for name in self._labels if name != "action"]
+        self._key, self._sim_size = tuple(self._labels.items()), len(state.sim)
+        self._blocks: dict[Any, tuple[StepBlock, np.ndarray]] = {}
+        first = step_messages(self._key, self._sim_size, has_expert=False, signals=()).late[1:]
+        for message in first:
+            self._writer.channel(message.topic, message.schema, message.about)
+        for name, topic in self._topics.items():
+            self._writer.channel(topic, IMAGE, {"unit": "1/255", "frame": name})
+        self._writer.channel("/task", "std_msgs/msg/String", {})
+        self._writer.channel("/events", "rcl_interfaces/msg/Log", {})
+        write_about(self._writer, about, self._labels, state, self._start_ns)
         self._writer.message("/task", self._start_ns, cdr.pack_string(spec.instruction))
         self._event(self._start_ns, "episode_begin", policy=origin.policy, seed=origin.seed, index=origin.index)
-        self._write_observation(self._start_ns, observation, state.sim)
+        numbers = np.concatenate([*(observation[name] for name in self._observed), state.sim])
+        for message in first:
+            self._writer.message(message.topic, self._start_ns, message.pack(self._start_ns, numbers[message.places]))
         self._write_pictures(self._start_ns, world)
-        self._steps, self._reward, self._failure = 0, 0.0, ""
+        self._writer.flush()
 
     def step(self, world: World, transition: Transition) -> None:
+        decision, result = transition.decision, transition.result
         now = self._start_ns + round(transition.step * 1e9 / self._hz)
         then = self._start_ns + round((transition.step + 1) * 1e9 / self._hz)
-        decision, result = transition.decision, transition.result
-        names = self._labels["action"]
-        self._writer.message("/action", now, cdr.pack_array(names, decision.action))
-        if self._grips:
-            self._writer.message("/gripper/command", now, cdr.pack_array(self._grips, decision.action[self._grip_at]))
+        parts = [result.observation[name] for name in self._observed]
+        parts += [world.sim_state(), (result.reward, result.success, transition.done, decision.intervention)]
+        parts.append(decision.action)
         if decision.expert_action is not None:
-            self._writer.message(CHANNELS["expert_action"].topic, now, cdr.pack_array(names, decision.expert_action))
-        numbers = np.array([result.reward, result.success, transition.done, decision.intervention], dtype=float)
-        self._writer.message("/step", then, cdr.pack_array(STEP_LABELS, numbers))
-        self._write_observation(then, result.observation, world.sim_state())
+            parts.append(decision.expert_action)
+        parts += [list(components.values()) for components in decision.signals.values()]
+        block, places = self._block(decision)
+        records = block.fill(np.concatenate(parts)[places], (now, then))
+        times = [then if late else now for late in block.late]
+        self._writer.block(records, block.channels, block.offsets, times)
         self._write_pictures(then, world)
         self._steps, self._reward = transition.step + 1, self._reward + result.reward
         self._failure = result.failure
@@ -122,44 +129,37 @@ class McapRecorder:
         if hasattr(self, "_writer"):
             self._writer.discard()
 
-    def _announce(self) -> None:
-        for row in (*self._rows.values(), *(channel(name) for name in ("sim_state", "action", "expert_action"))):
-            self._writer.channel(row.topic, row.schema, {"unit": row.unit, "frame": row.frame})
-        for name, topic in self._topics.items():
-            self._writer.channel(topic, IMAGE, {"unit": "1/255", "frame": name})
-        self._writer.channel("/step", CHANNELS["reward"].schema, {"unit": "1", "frame": "task"})
-        self._writer.channel("/gripper/command", CHANNELS["action"].schema, {"unit": "controller"})
-        self._writer.channel("/tf", "tf2_msgs/msg/TFMessage", {"unit": "m", "frame": "world"})
-        self._writer.channel("/task", "std_msgs/msg/String", {})
-        self._writer.channel("/events", "rcl_interfaces/msg/Log", {})
+    def _block(self, decision: Decision) -> tuple[StepBlock, np.ndarray]:
+        """The block of a step's messages, and the places of its numbers."""
+        has_expert = decision.expert_action is not None
+        signals = tuple((name, tuple(components)) for name, components in decision.signals.items())
+        if (has_expert, signals) not in self._blocks:
+            made = step_messages(self._key, self._sim_size, has_expert=has_expert, signals=signals)
+            messages = [(message, False) for message in made.early] + [(message, True) for message in made.late]
+            for message, _ in messages:
+                self._writer.channel(message.topic, message.schema, message.about)
+            block = StepBlock([BlockMessage(self._writer.number(m.topic), m.layout, late) for m, late in messages])
+            self._blocks[has_expert, signals] = block, np.concatenate([m.places for m, _ in messages])
+        return self._blocks[has_expert, signals]
 
     def _event(self, now: int, event: str, **facts: Any) -> None:
         self._writer.message("/events", now, cdr.pack_log(now, json.dumps({"event": event, **facts})))
 
-    def _write_observation(self, now: int, seen: Observation, sim_state: np.ndarray) -> None:
-        kinds = [joints for joints in JOINT_KINDS if f"{joints}_pos" in self._labels]  # not every arm has a gripper
-
-        def joined(kind: str) -> np.ndarray:
-            return np.concatenate([seen[f"{joints}_{kind}"] for joints in kinds])
-
-        names = tuple(n for joints in kinds for n in self._labels[f"{joints}_pos"])
-        state = cdr.JointState(names, joined("pos"), joined("vel"), joined("effort"))
-        self._writer.message("/joint_states", now, cdr.pack_joint_state(now, state))
-        frames = []
-        for name, row in self._rows.items():
-            if row.schema == POSE and row.field == "position":
-                body = name.removesuffix("_pos")
-                pose = seen[name], xyzw_from_wxyz(seen[f"{body}_quat"])
-                self._writer.message(row.topic, now, cdr.pack_pose(now, *pose))
-                frames.append((body, *pose))
-            elif row.schema == ARRAY:
-                self._writer.message(row.topic, now, cdr.pack_array(self._labels[name], seen[name]))
-        self._writer.message("/tf", now, cdr.pack_transforms(now, frames))
-        self._writer.message("/sim/state", now, cdr.pack_array(("mjSTATE_INTEGRATION",), sim_state))
-
     def _write_pictures(self, now: int, world: World) -> None:
         for name, picture in world.pictures().items():
             self._writer.message(self._topics[name], now, cdr.pack_image(now, name, encode_png(picture)))
+
+
+def write_about(
+    writer: McapWriter, about: EpisodeMetadata, labels: Labels, state: WorldState | None, start_ns: int
+) -> None:
+    """Write what an episode is: its metadata and, where there is one, the simulation that it began in."""
+    texts = {key: value if isinstance(value, str) else json.dumps(value) for key, value in asdict(about).items()}
+    writer.metadata(BEGIN, texts | {"format": FORMAT, "labels": json.dumps(labels)})
+    if state is not None:
+        memory = {key: value.tolist() for key, value in state.memory.items()}
+        writer.attachment(MODEL, "application/xml", state.model_xml.encode(), start_ns)
+        writer.attachment(MEMORY, "application/json", json.dumps(memory).encode(), start_ns)
 
 
 def read_episode(path: Path) -> Episode:
@@ -172,7 +172,7 @@ def read_episode(path: Path) -> Episode:
     if BEGIN not in content.metadata:
         raise RecordingError(f"{path} is an MCAP file, but no episode of lfd: it has no metadata {BEGIN!r}")
     if END not in content.metadata:
-        raise RecordingError(f"{path} was never finished: it has no metadata {END!r}; record the episode again")
+        raise RecordingError(f"{path} was never finished: it has no metadata {END!r}; try `lfd recover {path.parent}`")
     about = dict(content.metadata[BEGIN])
     if about.get("format") != FORMAT:
         raise RecordingError(f"{path} has format {about.get('format')!r}, this lfd reads {FORMAT!r}")
@@ -190,21 +190,23 @@ def _decode(content: McapContent, about: dict[str, str]) -> Episode:
     labels = {name: tuple(names) for name, names in json.loads(about["labels"]).items()}
     kinds = {f.name: f.type for f in fields(EpisodeMetadata)}
     metadata: dict[str, Any] = {
-        key: about[key] if kind is str else json.loads(about[key]) for key, kind in kinds.items()
+        key: about[key] if kind is str else json.loads(about[key])
+        for key, kind in kinds.items()
+        if key != "recovered" or key in about
     }
-    step_names, steps = _array(content, "/step")
+    step_names, steps = arrays(_data(content, "/step"))
     columns = dict(zip(step_names, steps.T, strict=True))
     stamps = np.array([stamp for stamp, _ in _messages(content, "/joint_states")], dtype=np.int64)
     expert = CHANNELS["expert_action"].topic
     return Episode(
         times=(stamps - stamps[0]) / 1e9,
         observations={name: _observed(content, name, labels[name]) for name in labels if name != "action"},
-        actions=_array(content, "/action")[1],
+        actions=arrays(_data(content, "/action"))[1],
         rewards=columns["reward"],
         successes=columns["success"] > 0.5,
         interventions=columns["intervention"] > 0.5,
-        expert_actions=_array(content, expert)[1] if expert in content.messages else None,
-        sim_states=_array(content, "/sim/state")[1],
+        expert_actions=arrays(_data(content, expert))[1] if expert in content.messages else None,
+        sim_states=arrays(_data(content, "/sim/state"))[1],
         pictures={
             topic.removeprefix(CAMERAS): tuple(cdr.unpack_image(data) for _, data in messages)
             for topic, messages in content.messages.items()
@@ -213,8 +215,12 @@ def _decode(content: McapContent, about: dict[str, str]) -> Episode:
         labels=labels,
         metadata=EpisodeMetadata(**metadata),
         model_xml=content.attachments[MODEL].decode(),
-        start_memory={k: np.array(v) for k, v in json.loads(content.attachments[MEMORY]).items()},
+        start_memory=_memory(content.attachments.get(MEMORY)),
     )
+
+
+def _memory(attached: bytes | None) -> Mapping[str, np.ndarray] | None:
+    return None if attached is None else {key: np.array(value) for key, value in json.loads(attached).items()}
 
 
 def _messages(content: McapContent, topic: str) -> list[tuple[int, bytes]]:
@@ -223,24 +229,21 @@ def _messages(content: McapContent, topic: str) -> list[tuple[int, bytes]]:
     return content.messages[topic]
 
 
-def _array(content: McapContent, topic: str) -> tuple[tuple[str, ...], np.ndarray]:
-    decoded = [cdr.unpack_array(data) for _, data in _messages(content, topic)]
-    return decoded[0][0], np.array([values for _, values in decoded])
+def _data(content: McapContent, topic: str) -> list[bytes]:
+    return [data for _, data in _messages(content, topic)]
 
 
 def _observed(content: McapContent, name: str, labels: tuple[str, ...]) -> np.ndarray:
     row = channel(name)
-    messages = _messages(content, row.topic)
+    messages = _data(content, row.topic)
     if row.schema == POSE:
-        poses = [cdr.unpack_pose(data) for _, data in messages]
-        position, orientation = np.array([p for p, _ in poses]), np.array([q for _, q in poses])
-        return position if row.field == "position" else wxyz_from_xyzw(orientation)
+        rows = poses(messages)
+        return rows[:, :3] if row.field == "position" else wxyz_from_xyzw(rows[:, 3:])
     if row.schema == ARRAY:
-        return _array(content, row.topic)[1]
+        return arrays(messages)[1]
     assert row.schema == JOINT_STATE
-    states = [cdr.unpack_joint_state(data) for _, data in messages]
-    columns = [states[0].name.index(label) for label in labels]
-    return np.array([getattr(state, row.field) for state in states])[:, columns]
+    names, states = joint_states(messages)
+    return states[:, ("position", "velocity", "effort").index(row.field)][:, [names.index(label) for label in labels]]
 
 
 def recordings_in(sources: list[Path]) -> list[Path]:

@@ -1,0 +1,108 @@
+"""Where the numbers stand in a message whose other bytes are always the same.
+
+The messages of a topic differ in their stamps and their float64 numbers alone, as long as names and sizes stay. So
+one message is packed the plain way (`lfd.record.cdr`), and what it tells serves all others: a step is written by
+copying its numbers into a block of bytes, and a whole topic is read by one indexing operation.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from lfd.record.mcap_writing import MESSAGE_HEAD
+
+Pack = Callable[[int, Float[np.ndarray, "F"]], bytes]
+"""Packs a message from its stamp [ns] and its numbers."""
+PROBE_STAMP = 0x01010101 * 10**9 + 0x01010101
+"""A stamp of which no byte is zero, neither of its seconds nor of its nanoseconds."""
+PROBE = np.frombuffer(b"\xff" * 8)[0]
+"""A number (not finite) of which no byte is zero."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The bytes of a message, and which of them are its numbers and stamps."""
+
+    template: UInt8[np.ndarray, "bytes"]
+    """The message with zeros for numbers and stamps."""
+    numbers: Int[np.ndarray, "8F"]
+    """Places of the numbers' bytes, in the order in which they are packed."""
+    stamps: Int[np.ndarray, "S 8"]
+    """Places of the stamps' bytes: seconds (4), then nanoseconds (4)."""
+
+    @classmethod
+    def of(cls, pack: Pack, size: int) -> "Layout":
+        """The layout of messages that `pack` makes of `size` numbers."""
+
+        def packed(stamp: int, number: float) -> np.ndarray:
+            return np.frombuffer(pack(stamp, np.full(size, number)), np.uint8)
+
+        zero = packed(0, 0.0)
+        numbers = np.flatnonzero(packed(0, PROBE) != zero)
+        assert len(numbers) == 8 * size, "packing must keep the numbers as they are and in their order"
+        return cls(zero, numbers, np.flatnonzero(packed(PROBE_STAMP, 0.0) != zero).reshape(-1, 8))
+
+    def read(self, messages: Sequence[bytes]) -> Float[np.ndarray, "N F"] | None:
+        """The numbers of messages, or None when one of them has other names or sizes."""
+        size = len(self.template)
+        joined = b"".join(messages)
+        if len(joined) != size * len(messages) or any(len(m) != size for m in messages):
+            return None
+        rows = np.frombuffer(joined, np.uint8).reshape(len(messages), size)
+        fixed = np.ones(size, dtype=bool)
+        fixed[self.numbers] = fixed[self.stamps] = False
+        if not (rows[:, fixed] == self.template[fixed]).all():
+            return None
+        return np.ascontiguousarray(rows[:, self.numbers]).view("<f8")
+
+
+@dataclass(frozen=True)
+class BlockMessage:
+    """One message of a block."""
+
+    channel: int
+    """Number of its topic in the file."""
+    layout: Layout
+    late: bool
+    """Whether it stands at the second of the block's two times."""
+
+
+class StepBlock:
+    """The message records of a control step, always the same but for numbers and stamps.
+
+    A step has two times: that of its action and that of the observation after it.
+    """
+
+    def __init__(self, messages: Sequence[BlockMessage]):
+        parts, numbers, at = [], [], 0
+        stamps: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+        clocks: tuple[list[np.ndarray], list[np.ndarray]] = [], []
+        self.channels = tuple(m.channel for m in messages)
+        self.late = tuple(m.late for m in messages)
+        offsets = []
+        for message in messages:
+            body = message.layout
+            head = np.frombuffer(MESSAGE_HEAD.pack(5, 22 + len(body.template), message.channel, 0, 0, 0), np.uint8)
+            offsets.append(at)
+            clocks[message.late].append(at + 15 + np.arange(16).reshape(2, 8))  # log time, publish time
+            numbers.append(at + len(head) + body.numbers)
+            stamps[message.late].append(at + len(head) + body.stamps)
+            parts += [head, body.template]
+            at += len(head) + len(body.template)
+        self.offsets = tuple(offsets)
+        self._bytes = np.concatenate(parts)
+        self._numbers = np.concatenate(numbers)
+        none = np.empty((0, 8), dtype=int)
+        self._stamps = [np.concatenate([none, *places]) for places in stamps]
+        self._clocks = [np.concatenate([none, *places]) for places in clocks]
+
+    def fill(self, numbers: Float[np.ndarray, "F"], times_ns: tuple[int, int]) -> bytes:
+        """The records with the numbers of all messages, one after the other, and their two times."""
+        block = self._bytes
+        block[self._numbers] = numbers.view(np.uint8)
+        for time_ns, stamps, clocks in zip(times_ns, self._stamps, self._clocks, strict=True):
+            block[stamps] = np.array(divmod(time_ns, 10**9), dtype="<u4").view(np.uint8)
+            block[clocks] = np.array([time_ns], dtype="<u8").view(np.uint8)
+        return block.tobytes()
