@@ -29,7 +29,7 @@ _PUBLIC = {
     "read_episode": "lfd.record.episode_file",
     "rollout": "lfd.worlds.rollout",
     "rollouts": "lfd.worlds.rollout",
-    "verify": "lfd.convert.to_lerobot",
+    "verify": "lfd.convert.verify",
     "verify_replay": "lfd.replay.verify",
     "wilson_interval": "lfd.run.wilson",
 }

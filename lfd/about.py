@@ -8,6 +8,7 @@ from lfd.core.errors import InputError
 from lfd.core.recipe import as_table, build, describe, load_toml
 from lfd.record.episode_file import BEGIN, END, read_episode
 from lfd.record.mcap_file import SUFFIX, read_mcap
+from lfd.record.topic_rates import topic_rates
 
 
 def about(path: Path) -> dict[str, Any]:
@@ -41,29 +42,41 @@ def about(path: Path) -> dict[str, Any]:
 def _about_recipe(path: Path) -> dict[str, Any]:
     """Every key that the recipe's tables know, with its value and its meaning."""
     from lfd.convert.features import ConvertRecipe
+    from lfd.convert.mapping import ResampleRecipe, map_recipe
     from lfd.policies.registry import recipe_class
     from lfd.record.demonstrations import RecordRecipe
     from lfd.run.evaluate import EvalRecipe
     from lfd.train.behavior_cloning import TrainRecipe
-    from lfd.worlds.robots import RobotConfig
+    from lfd.worlds.robots import RobotConfig, TeleopConfig
 
     kinds: dict[str, type] = {
         "robot": RobotConfig,
+        "teleop": TeleopConfig,
         "record": RecordRecipe,
         "convert": ConvertRecipe,
+        "resample": ResampleRecipe,
         "train": TrainRecipe,
         "eval": EvalRecipe,
     }
     facts: dict[str, Any] = {"kind": "recipe"}
-    for name, table in load_toml(path, (*kinds, "policy")).items():
+    tables = load_toml(path, (*kinds, "policy", "map"))
+    for name, table in tables.items():
+        if name == "map":
+            for channel, entry in map_recipe(tables, str(path)).entries.items():
+                facts |= _about_keys(f"map.{channel}", entry)
+            continue
         kind = kinds[name] if name != "policy" else recipe_class(table, f"{path} [policy]")
-        values = as_table(build(kind, table, f"{path} [{name}]"))
-        meanings = describe(kind)
-        facts |= {f"{name}.{key}": {"value": value, "meaning": meanings[key]} for key, value in values.items()}
+        facts |= _about_keys(name, build(kind, table, f"{path} [{name}]"))
     return facts
 
 
+def _about_keys(name: str, values: Any) -> dict[str, Any]:
+    meanings = describe(type(values))
+    return {f"{name}.{key}": {"value": v, "meaning": meanings[key]} for key, v in as_table(values).items()}
+
+
 def _about_recording(path: Path) -> dict[str, Any]:
+    """What is in an MCAP file, ours or another program's."""
     content = read_mcap(path)
     facts: dict[str, Any] = {"kind": "recording", "bytes": path.stat().st_size}
     stamps = [stamp for messages in content.messages.values() for stamp, _ in messages]
@@ -74,8 +87,13 @@ def _about_recording(path: Path) -> dict[str, Any]:
         keys = ("task", "robot", "controller", "policy", "control_hz", "stage", "seed", "index", "stepper", "started")
         facts |= {key: getattr(episode.metadata, key) for key in keys}
         facts |= dict(content.metadata[END])
-    for topic, messages in sorted(content.messages.items()):
-        span = (messages[-1][0] - messages[0][0]) / 1e9
-        rate = f", {(len(messages) - 1) / span:.1f} Hz" if span > 0 else ""
-        facts[f"topic {topic}"] = f"{len(messages)} messages{rate}"
-    return facts
+    for name, record in content.metadata.items():
+        if name not in (BEGIN, END):
+            facts |= {f"metadata {name} {key}": _shortened(value) for key, value in record.items()}
+    facts |= {f"attachment {name}": f"{len(data)} bytes" for name, data in content.attachments.items()}
+    return facts | {f"topic {rate.topic}": str(rate) for rate in topic_rates(content)}
+
+
+def _shortened(text: str, most: int = 120) -> str:
+    line = " ".join(text.split())
+    return line if len(line) <= most else f"{line[:most]} ... ({len(text)} characters)"

@@ -12,6 +12,7 @@ from typing import Any
 from lfd import commands
 from lfd.commands import Result
 from lfd.core.errors import InputError, LfdError
+from lfd.experts.keys import HELP
 from lfd.worlds.rendering import check_wish
 
 PIPELINE = """\
@@ -140,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
 
     def parallel(made: Any) -> None:
         made.add_argument(
-            "--worlds", type=_count, default=2**16, metavar="N",
+            "--worlds", type=_count, default=commands.ALL_WORLDS, metavar="N",
             help="worlds to run in parallel at the most; the result is the same (default: one a core)",
         )  # fmt: skip
         cluster(made)
@@ -154,6 +155,13 @@ def _parser() -> argparse.ArgumentParser:
     made.add_argument("recipe", type=Path, metavar="RECIPE", help="dataset recipe, a TOML file with a [record] table")
     made.add_argument("--episodes", type=int, metavar="N", help="successful demonstrations to record")
     made.add_argument("--seed", type=int, metavar="S", help="seed of start states and noise")
+    made.add_argument(
+        "--device", metavar="DEVICE",
+        help="you demonstrate, with keyboard, spacemouse or gamepad, instead of the scripted expert; keys are below",
+    )  # fmt: skip
+    made.add_argument("--no-view", action="store_true", help="with --device: no live view of the robot")
+    made.add_argument("--resume", action="store_true", help="go on with the recordings of the folder")
+    made.epilog += f"\n         lfd record datasets/lift_panda.toml --device keyboard --out outputs/mine\n\n{HELP}"
     parallel(made)
     output(made, "the recordings")
     overrides(made)
@@ -164,12 +172,78 @@ def _parser() -> argparse.ArgumentParser:
         "convert recordings into a LeRobot v3 dataset and verify it by reading both back",
         "lfd convert outputs/recordings --out outputs/dataset",
     )
-    made.add_argument("sources", type=Path, nargs="+", metavar="FILE|DIR", help="recordings, or folders of them")
+    made.add_argument(
+        "sources", type=Path, nargs="+", metavar="FILE|DIR",
+        help="recordings of lfd, MCAP files of other programs, ROS 2 bags, robosuite's or robomimic's HDF5 files, or "
+        "folders of them",
+    )  # fmt: skip
     made.add_argument(
         "--recipe", type=Path, metavar="RECIPE",
-        help="dataset recipe whose [convert] table says what becomes what; default: the one kept in the recordings",
+        help="dataset recipe: its [convert] table says what becomes what (default: the one kept in the recordings), "
+        "[resample] and [map.NAME] do for files of other programs, [video] how pictures are kept",
     )  # fmt: skip
+    made.add_argument("--append", action="store_true", help="add the episodes to the dataset that is there")
+    made.add_argument(
+        "--skip-bad",
+        action="store_true",
+        help="leave out recordings that cannot be used, and list them, instead of ending",
+    )
+    made.add_argument(
+        "--trust-rows", action="store_true", help="in HDF5 files whose own counts differ from their rows, take the rows"
+    )
+    made.add_argument("--jobs", type=_count, metavar="N", help="processes that read (default: what is worth it)")
+    cluster(made)
     output(made, "the dataset")
+
+    made = command(
+        "verify",
+        commands.run_verify,
+        "compare every number, task, unit and boundary of a dataset with its sources",
+        "lfd verify outputs/dataset outputs/recordings",
+    )
+    made.add_argument("dataset", type=Path, metavar="DATASET", help="LeRobot dataset folder")
+    made.add_argument("sources", type=Path, nargs="+", metavar="FILE|DIR", help="what it was converted from, in order")
+    made.add_argument(
+        "--recipe",
+        type=Path,
+        metavar="RECIPE",
+        help="recipe of the conversion (default: the one that the dataset keeps)",
+    )
+
+    made = command(
+        "export",
+        commands.run_export,
+        "write episodes as MCAP files, or as an HDF5 file on which robomimic trains",
+        "lfd export outputs/recordings --to robomimic --out outputs/demos.hdf5",
+    )
+    made.add_argument(
+        "sources", type=Path, nargs="+", metavar="FILE|DIR|DATASET",
+        help="one LeRobot dataset, or recordings, HDF5 demonstrations, or folders of them",
+    )  # fmt: skip
+    made.add_argument("--to", required=True, choices=["mcap", "robomimic"], help="format")
+    made.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="robomimic: draws the tenth for validation (default: 0)"
+    )
+    made.add_argument(
+        "--trust-rows", action="store_true", help="in HDF5 files whose own counts differ from their rows, take the rows"
+    )
+    output(made, "the MCAP files, or the HDF5 file")
+
+    made = command(
+        "trace",
+        commands.run_trace,
+        "print the chain policy, dataset, recordings, and whether each is still what it was",
+        "lfd trace outputs/policy",
+    )
+    made.add_argument("path", type=Path, metavar="PATH", help="folder of a dataset, policy, evaluation or export")
+
+    made = command(
+        "recover",
+        commands.run_recover,
+        "make episodes of what a crash left, and of damaged recordings what is whole of them",
+        "lfd recover outputs/recordings",
+    )
+    made.add_argument("folder", type=Path, metavar="DIR", help="folder of recordings")
 
     made = command(
         "train",

@@ -1,5 +1,8 @@
 """What a person at a terminal sees: progress bars on standard error, tables on standard output."""
 
+import shutil
+import sys
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
@@ -15,6 +18,9 @@ from rich.progress import (
 )
 from rich.table import Table
 from rich.text import Text
+
+STATUS_S = 0.2
+"""Time between updates of a status line [s]."""
 
 
 class _Bar:
@@ -39,6 +45,35 @@ def progress_bar(label: str, total: int) -> Iterator[_Bar]:
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
         yield _Bar(progress, progress.add_task(label, total=total, note=""))
+
+
+class StatusLine:
+    """One line on standard error that is written over, or a line for each new state where that is no terminal.
+
+    Nothing is written between the updates, and none of them ends the line: keys may be read meanwhile.
+    """
+
+    def __init__(self) -> None:
+        self._state, self._shown, self._written = "", "", 0.0
+
+    def __call__(self, state: str, detail: str) -> None:
+        now, is_new = time.monotonic(), state != self._state
+        if not is_new and now - self._written < STATUS_S:
+            return
+        self._state, self._written = state, now
+        if sys.stderr.isatty():
+            text = f"{state}  {detail}"[: shutil.get_terminal_size().columns - 1]
+            if text != self._shown:
+                sys.stderr.write(f"\r\x1b[2K{text}")
+                sys.stderr.flush()
+            self._shown = text
+        elif is_new:
+            print(f"{state}  {detail}", file=sys.stderr, flush=True)
+
+    def close(self) -> None:
+        """Leave the last state standing."""
+        if self._state and sys.stderr.isatty():
+            print(file=sys.stderr)
 
 
 def print_table(title: str, rows: Mapping[str, object]) -> None:

@@ -6,9 +6,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from lfd.convert.to_lerobot import verify
+from lfd.convert.verify import verify
 from lfd.core.errors import VerificationError
 from lfd.record.episode_file import read_episode, recordings_in
+from tests.conftest import LIFT
 
 
 def test_lerobot_opens_the_dataset_and_finds_the_recorded_numbers(thread) -> None:
@@ -70,8 +71,11 @@ def test_recordings_that_do_not_go_together_are_refused(thread, lfd_fails, lift_
     from tests.test_record_episode_file import record_steps
 
     record_steps(make_world("Lift", "panda", 10), tmp_path / "slow.mcap", np.zeros((2, 7)))
-    error = lfd_fails("convert", thread.recordings, tmp_path / "slow.mcap", "--out", tmp_path / "dataset")
-    assert "slow.mcap has control_hz 10" in error
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(LIFT.read_text().replace('"expert_action"', '"action"'))
+    sources = (thread.recordings, tmp_path / "slow.mcap")
+    error = lfd_fails("convert", *sources, "--recipe", recipe, "--out", tmp_path / "dataset")
+    assert "slow.mcap has control_hz 10, the episodes before it have 20" in error
     assert not (tmp_path / "dataset").exists()
 
 

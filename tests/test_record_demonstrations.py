@@ -2,6 +2,7 @@ import os
 from ctypes.util import find_library
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,6 +57,7 @@ def filmed(tmp_path_factory) -> Path:
     cameras = ["agentview", "robot0_eye_in_hand"]
     tables["record"] |= {"episodes": 1, "cameras": cameras, "camera_height": 48, "camera_width": 64}
     tables["convert"]["cameras"] = cameras
+    tables["video"] = {"codec": "png"}
     record(build(RecordRecipe, tables["record"], "recipe"), folder / "recordings", tables=tables)
     convert([folder / "recordings"], folder / "dataset")  # verifies every pixel
     return folder
@@ -76,14 +78,15 @@ def test_pictures_show_the_recorded_states(filmed) -> None:
 
 
 def test_pictures_are_in_the_dataset_and_in_the_replay(filmed, tmp_path) -> None:
-    from lfd.convert.to_lerobot import lerobot_datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
     from lfd.record.png import decode_png
     from lfd.replay.clip import clip_of
     from lfd.replay.rerun_scene import replay
 
     episode = read_episode(filmed / "recordings" / "episode_000000.mcap")
-    with lerobot_datasets() as dataset_class:
-        row = dataset_class("lfd/filmed", root=filmed / "dataset", video_backend="pyav")[7]
+    dataset: Any = LeRobotDataset("lfd/filmed", root=filmed / "dataset", video_backend="pyav")
+    row = dataset[7]
     seen = (row["observation.images.agentview"].numpy().transpose(1, 2, 0) * 255).round().astype(np.uint8)
     np.testing.assert_array_equal(seen, decode_png(episode.pictures["agentview"][7]))
     bytes_saved = {}

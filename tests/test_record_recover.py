@@ -1,4 +1,4 @@
-"""That a crash loses half a second of one episode at the most: a real recording is killed, again and again."""
+"""That a crash loses no step that was recorded: a real recording is killed, again and again."""
 
 import os
 import random
@@ -91,7 +91,7 @@ def record_until_killed(recorder: subprocess.Popen[str], folder: Path, moment: i
     return ended, steps
 
 
-def test_a_killed_recording_loses_half_a_second_at_the_most(recorder, tmp_path) -> None:
+def test_a_killed_recording_loses_not_even_a_step(recorder, tmp_path) -> None:
     chance = random.Random(0)
     for number in range(20):
         folder = tmp_path / str(number)
@@ -106,7 +106,7 @@ def test_a_killed_recording_loses_half_a_second_at_the_most(recorder, tmp_path) 
         assert list(folder.glob("*.part")) == [] or not done[0].episode
         saved = done[0].steps if done else 0
         running = steps if len(finished) == ended else 0
-        assert running - saved <= HZ / 2, f"{running} steps were told of, {saved} saved"
+        assert running - saved <= 0, f"{running} steps were told of, {saved} saved"
         if saved:
             episode = read_episode(Path(done[0].episode))
             assert len(episode) == saved
@@ -124,18 +124,18 @@ def test_a_recovered_episode_replays_without_deviation(recorder, tmp_path) -> No
 
 def test_a_flipped_bit_costs_the_steps_of_its_chunk(lift_world, tmp_path, rng) -> None:
     path = tmp_path / "episode.mcap"
-    record_steps(lift_world, path, rng.uniform(-0.3, 0.3, (60, 7)))
+    record_steps(lift_world, path, rng.uniform(-0.3, 0.3, (260, 7)))
     whole, good = read_episode(path), path.read_bytes()
     chunks = [match.start() for match in re.finditer(b"\x04\0\0\0zstd", good)]
     damaged = bytearray(good)
-    damaged[chunks[3] + 60] ^= 4
+    damaged[chunks[2] + 60] ^= 4
     path.write_bytes(damaged)
     with pytest.raises(RecordingError, match="save what is whole with `lfd recover"):
         read_episode(path)
     (done,) = recover(tmp_path)
     assert (tmp_path / "episode.mcap.damaged").read_bytes() == damaged
     episode = read_episode(path)
-    assert len(episode) == done.steps > 25
+    assert len(episode) == done.steps > 100
     assert done.dropped_steps > 0
     begin = int(np.flatnonzero((whole.actions == episode.actions[0]).all(axis=1))[0])
     np.testing.assert_array_equal(episode.actions, whole.actions[begin : begin + len(episode)])

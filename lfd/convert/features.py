@@ -10,12 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from lfd.convert.frames import EpisodeFrames, Pictures
 from lfd.core.channels import CHANNELS, ENVIRONMENT_STATE, STATE, channel
 from lfd.core.episode import Episode
 from lfd.core.errors import DatasetError, RecipeError, UnknownName
+from lfd.core.recipe import as_table
 from lfd.record.png import decode_png
 
 FLAGS = ("reward", "success", "done", "intervention")
+CLOCK_TOLERANCE_S = 1e-4  # LeRobot's own
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +32,9 @@ class ConvertRecipe:
     action: str
     """What becomes the action to imitate: `expert_action`, as the expert meant it, or `action`, as it was applied."""
     cameras: tuple[str, ...] = ()
-    """Cameras whose pictures become observation.images.CAMERA, without loss."""
+    """Cameras whose pictures become observation.images.CAMERA."""
+    failures: bool = True
+    """Whether episodes that do not end in success are taken too."""
 
     def check(self, where: str) -> None:
         if self.action not in ("action", "expert_action"):
@@ -41,68 +46,85 @@ class ConvertRecipe:
                     raise RecipeError(f"{where} {key}: channel {name!r} does not belong to {feature}")
             if len(set(names)) != len(names):
                 raise RecipeError(f"{where} {key}: a channel is listed twice: {', '.join(names)}")
+        if len(set(self.cameras)) != len(self.cameras):
+            raise RecipeError(f"{where} cameras: a camera is listed twice: {', '.join(self.cameras)}")
 
 
-def component_names(episode: Episode, channels: tuple[str, ...]) -> list[str]:
-    """Names of the components of joined channels, such as `ee_pos.x`.
+def frames_of_episode(
+    episode: Episode, recipe: ConvertRecipe, source: str, *, notes: Mapping[str, Any] | None = None
+) -> EpisodeFrames:
+    """The rows 0 to T - 1 of an episode: each action with the observation before it.
 
-    Raises `UnknownName` for a channel that the episode does not have.
+    Raises `UnknownName` for a channel or camera that the episode does not have, `DatasetError` when the recipe wants
+    the expert's actions and there are none, or when a time is off its step.
     """
+    _check_clock(episode, source)
+    action = CHANNELS["action"]
+    actions = episode.actions if recipe.action == "action" else episode.expert_actions
+    if actions is None:
+        raise DatasetError(
+            f'{source}: no expert was asked in this episode; set `action = "action"` in the recipe\'s [convert]'
+        )
+    columns: dict[str, np.ndarray] = {}
+    names: dict[str, tuple[str, ...]] = {}
+    units: dict[str, tuple[str, ...]] = {}
+    for feature, channels in ((STATE, recipe.state), (ENVIRONMENT_STATE, recipe.environment_state)):
+        if channels or feature == STATE:
+            names[feature], units[feature] = _components(episode, channels)
+            rows = [episode.observations[name][:-1] for name in channels]
+            columns[feature] = np.concatenate(rows, axis=1).astype(np.float32)
+    columns["action"] = actions.astype(np.float32)
+    names["action"] = episode.labels["action"]
+    units["action"] = (action.unit,) * len(names["action"])
+    done = np.arange(len(episode)) == len(episode) - 1
+    flags = (episode.rewards.astype(np.float32), episode.successes, done, episode.interventions)
+    for name, values in zip(FLAGS, flags, strict=True):
+        row = CHANNELS[name]
+        assert row.feature is not None
+        columns[row.feature], names[row.feature], units[row.feature] = values[:, None], (name,), (row.unit,)
+    about = episode.metadata
+    said = {"recovered": about.recovered} if about.recovered else {}
+    return EpisodeFrames(
+        source=source,
+        fps=about.control_hz,
+        task=about.instruction,
+        columns=columns,
+        names=names,
+        units=units,
+        pictures={channel(f"{name}_picture").feature or "": _pictures(episode, name) for name in recipe.cameras},
+        about={
+            "robot": about.robot,
+            "controller": about.controller,
+            "task": about.task,
+            "control_hz": about.control_hz,
+        },
+        notes={**said, **(notes or {})},
+        recipe={**about.recipe, "convert": as_table(recipe)},
+        model_xml=episode.model_xml,
+    )
+
+
+def _components(episode: Episode, channels: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the components of joined channels, such as `ee_pos.x`, and their units."""
     for name in channels:
         if name not in episode.labels:
             raise UnknownName("channel", name, episode.labels)
-    return [f"{name}.{label}" for name in channels for label in episode.labels[name]]
+    labels = [(name, label) for name in channels for label in episode.labels[name]]
+    return tuple(f"{name}.{label}" for name, label in labels), tuple(channel(name).unit for name, _ in labels)
 
 
-def features_of(episode: Episode, recipe: ConvertRecipe) -> dict[str, dict[str, Any]]:
-    """LeRobot's description of the features that the recipe makes of an episode."""
-
-    def vector(names: list[str]) -> dict[str, Any]:
-        return {"dtype": "float32", "shape": (len(names),), "names": names}
-
-    features = {STATE: vector(component_names(episode, recipe.state))}
-    if recipe.environment_state:
-        features[ENVIRONMENT_STATE] = vector(component_names(episode, recipe.environment_state))
-    features["action"] = vector(list(episode.labels["action"]))
-    for name in recipe.cameras:
-        if name not in episode.pictures:
-            raise UnknownName("camera", name, episode.pictures, "A recipe's [record] cameras says what is recorded.")
-        shape = decode_png(episode.pictures[name][0]).shape
-        features[_picture(name)] = {"dtype": "image", "shape": shape, "names": ["height", "width", "channels"]}
-    for name in FLAGS:
-        kind = "float32" if name == "reward" else "bool"
-        features[_key(name)] = {"dtype": kind, "shape": (1,), "names": None}
-    return features
+def _pictures(episode: Episode, camera: str) -> Pictures:
+    if camera not in episode.pictures:
+        raise UnknownName("camera", camera, episode.pictures, "A recipe's [record] cameras says what is recorded.")
+    return Pictures(episode.pictures[camera][:-1], decode_png)
 
 
-def columns_of(episode: Episode, recipe: ConvertRecipe) -> Mapping[str, np.ndarray]:
-    """The T rows of each feature.
-
-    Raises `DatasetError` when the recipe wants the expert's actions and the episode has none.
-    """
-
-    def joined(channels: tuple[str, ...]) -> np.ndarray:
-        return np.concatenate([episode.observations[name][:-1] for name in channels], axis=1).astype(np.float32)
-
-    actions = episode.actions if recipe.action == "action" else episode.expert_actions
-    if actions is None:
-        raise DatasetError('no expert was asked in this episode; set `action = "action"` in the recipe\'s [convert]')
-    columns = {STATE: joined(recipe.state)}
-    if recipe.environment_state:
-        columns[ENVIRONMENT_STATE] = joined(recipe.environment_state)
-    for name in recipe.cameras:
-        columns[_picture(name)] = np.stack([decode_png(data) for data in episode.pictures[name][:-1]])
-    columns["action"] = actions.astype(np.float32)
-    done = np.arange(len(episode)) == len(episode) - 1
-    flags = (episode.rewards.astype(np.float32), episode.successes, done, episode.interventions)
-    return columns | {_key(name): values[:, None] for name, values in zip(FLAGS, flags, strict=True)}
-
-
-def _picture(camera: str) -> str:
-    return channel(f"{camera}_picture").feature or ""
-
-
-def _key(name: str) -> str:
-    feature = CHANNELS[name].feature
-    assert feature is not None
-    return feature
+def _check_clock(episode: Episode, source: str) -> None:
+    hz = episode.metadata.control_hz
+    late = np.abs(episode.times - np.arange(len(episode) + 1) / hz)
+    if late.max() > CLOCK_TOLERANCE_S:
+        at = int(late.argmax())
+        raise DatasetError(
+            f"{source}: the observation of step {at} stands at {episode.times[at]:.4f} s, {hz} Hz puts it at "
+            f"{at / hz:.4f} s"
+        )

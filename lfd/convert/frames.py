@@ -54,6 +54,8 @@ class EpisodeFrames:
     """Facts that all episodes of a dataset share: robot, controller, task. Kept in its manifest."""
     notes: Mapping[str, Any] = field(default_factory=dict)
     """Facts of this episode for the report: whether it was recovered, how far its replay deviates, gaps."""
+    recipe: Mapping[str, Any] = field(default_factory=dict)
+    """The tables by which it was made, as its dataset's manifest keeps them."""
     model_xml: str = ""
     """The MuJoCo model, where there is one."""
 

@@ -1,24 +1,26 @@
-"""The convert stage: recordings of one task and robot become one LeRobot v3 dataset."""
+"""The convert stage: recordings, ROS 2 bags and HDF5 demonstrations become one LeRobot v3 dataset, which may grow."""
 
-import os
-from collections.abc import Iterable, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from lfd.convert.features import ConvertRecipe, columns_of, features_of
-from lfd.core.artifact import new_folder, sha256, write_manifest
-from lfd.core.episode import Episode
-from lfd.core.errors import DatasetError, RecipeError, VerificationError
-from lfd.core.protocols import Progress, silent
-from lfd.core.recipe import as_table, build
-from lfd.record.episode_file import read_episode, recordings_in
+from lfd.convert.lerobot_writer import INFO, DatasetWriter, dataset_writer
+from lfd.convert.prepared import PreparedEpisode, prepare
+from lfd.convert.sources import SourceRecipe, Unit, frames_of, hashes, units_of
+from lfd.convert.verify import Placed, verify_placed
+from lfd.core.artifact import new_folder, read_manifest, write_manifest
+from lfd.core.errors import DatasetError, EpisodeError, InputError, OutputError, RecordingError
+from lfd.core.processes import ProcessMap, cores, in_order
+from lfd.core.protocols import Progress, UnitMap, silent
 
 MODEL = "model.xml"
-CLOCK_TOLERANCE_S = 1e-4  # LeRobot's own
+SKIPPABLE = (RecordingError, EpisodeError, DatasetError)
+"""What `skip_bad` may leave out: faults of a recording, not of the recipe."""
+WORTH_PROCESSES = 32 * 2**20
+"""Sources of so many bytes are read in processes of their own; fewer are read before a process has started."""
+AHEAD = 8
+"""Units for each CPU of a cluster that are sent there at once; their results wait in memory for their turn."""
 
 
 @dataclass(frozen=True)
@@ -26,161 +28,192 @@ class Converted:
     """What a run of the convert stage did."""
 
     episodes: int
+    """Episodes that were added."""
     frames: int
+    """Frames that were added."""
     compared: int
     """Numbers read back from the dataset and compared with the recordings."""
-
-
-@contextmanager
-def lerobot_datasets() -> Any:
-    """LeRobot's dataset class, offline and without progress bars of its own."""
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")
-    import datasets
-
-    shown = not datasets.are_progress_bars_disabled()
-    datasets.disable_progress_bars()
-    try:
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-        yield LeRobotDataset
-    finally:
-        if shown:
-            datasets.enable_progress_bars()
+    skipped: tuple[str, ...] = ()
+    """What was left out, and why."""
+    left_out: int = 0
+    """Recordings that the recipe leaves out, because they failed."""
+    notes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Episodes of which there is something to say: recovered, replayed with a deviation, cut at gaps."""
 
 
 def convert(
-    sources: list[Path],
+    sources: Sequence[Path],
     out: Path,
     *,
-    recipe: ConvertRecipe | None = None,
+    recipe: SourceRecipe | None = None,
+    append: bool = False,
+    skip_bad: bool = False,
+    jobs: int | None = None,
+    cluster: UnitMap | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Converted:
-    """Convert recordings (files, or folders of them) into the dataset folder `out`.
+    """Convert files, or folders of them, into the dataset folder `out`, or `append` them to the one that is there.
 
-    Without a `recipe`, the `[convert]` table kept in the first recording is used. The dataset is read back
-    and compared with the recordings before it appears under its name.
+    Without a `recipe`, the `[convert]` table kept in each recording is used. Units are read by `jobs` processes, by as
+    many as there are cores where it is worth it, or on a `cluster`; the dataset does not depend on that. It is read
+    back and compared with its sources before it appears under its name: after an interruption there is the old one or
+    none.
 
-    Raises `RecordingError` for a recording that cannot be read, `DatasetError` when recordings do not go
-    together, `OutputError` when `out` exists, `VerificationError` when the dataset differs.
+    Raises `RecordingError` or `EpisodeError` for a source that cannot be read and `DatasetError` when episodes do not
+    go together, unless `skip_bad` leaves them out; `OutputError` when `out` exists, `VerificationError` when the
+    dataset differs.
     """
-    paths = recordings_in(sources)
-    first = read_episode(paths[0])
-    recipe = recipe or _recipe_kept_in(first, paths[0])
-    with new_folder(out, overwrite=overwrite) as part, lerobot_datasets() as dataset_class:
-        part.rmdir()  # LeRobot makes the folder and refuses one that is there
-        meta = first.metadata
-        dataset = dataset_class.create(
-            repo_id=f"lfd/{out.name}",
-            root=part,
-            fps=meta.control_hz,
-            robot_type=meta.robot,
-            features=features_of(first, recipe),
-            use_videos=False,
-            video_backend="pyav",
-        )
-        frames = 0
+    recipe = recipe or SourceRecipe(where="the recipe")
+    recipe.check()
+    if append and not (out / INFO).is_file():
+        raise OutputError(f"{out} is no dataset that could grow; leave out --append to make one")
+    units = units_of(sources, recipe)
+    recipe = recipe.completed(units)
+    run = cluster or _processes(units, jobs)
+    tally = _Tally(skip_bad)
+    with new_folder(out, overwrite=overwrite, grow=append) as part:
+        manifest = (read_manifest(out) or {}) if append else {}
+        _refuse_known(units, manifest)
+        with dataset_writer(part) as writer, progress("convert", len(units)) as bar:
+            before = writer.episodes, writer.frames
+            for unit, episodes, error in _read(units, recipe, run):
+                tally.take(writer, unit, episodes, error, part)
+                bar.advance(note=f"{writer.frames - before[1]} frames")
+            if writer.episodes == before[0]:
+                reasons = "; ".join(tally.skipped.values()) or "all are failures"
+                raise DatasetError(f"not one episode is left to convert: {reasons}")
+        _describe(part, recipe, tally, manifest)
+        compared = verify_placed(part, tally.placed, recipe, _processes(units, jobs), progress)
+    return Converted(
+        episodes=writer.episodes - before[0],
+        frames=writer.frames - before[1],
+        compared=compared,
+        skipped=tuple(tally.skipped.values()),
+        left_out=tally.left_out,
+        notes=tally.notes,
+    )
+
+
+def _processes(units: Sequence[Unit], jobs: int | None) -> ProcessMap:
+    if jobs is not None:
+        return ProcessMap(jobs)
+    return ProcessMap(cores() if sum(unit.bytes for unit in units) >= WORTH_PROCESSES else 1)
+
+
+def _read(
+    units: Sequence[Unit], recipe: SourceRecipe, run: UnitMap
+) -> Iterator[tuple[Unit, list[PreparedEpisode], InputError | None]]:
+    """The episodes of every unit in order, or what is wrong with it."""
+    size = len(units) if isinstance(run, ProcessMap) else max(1, AHEAD * run.cpus)
+    for begin in range(0, len(units), size):
+        some = units[begin : begin + size]
+        if isinstance(run, ProcessMap):
+            results = in_order(run(_prepare_unit, recipe, some))
+        else:
+            results = in_order(run(_prepare_sent, recipe, [unit.packed() for unit in some]))
+        for unit, (episodes, error) in zip(some, results, strict=True):
+            yield unit, episodes, error
+
+
+def _prepare_unit(recipe: SourceRecipe, unit: Unit) -> tuple[list[PreparedEpisode], InputError | None]:
+    """A worker's part of a conversion."""
+    try:
+        video = recipe.video()
+        return [prepare(frames, video) for frames in frames_of(unit, recipe)], None
+    except SKIPPABLE as error:
+        return [], error
+
+
+def _prepare_sent(recipe: SourceRecipe, unit: Any) -> tuple[list[PreparedEpisode], InputError | None]:
+    """The same on another machine, to which the unit's files were sent."""
+    with unit.unpacked() as here:
+        return _prepare_unit(recipe, here)
+
+
+class _Tally:
+    """What became of the units so far."""
+
+    def __init__(self, skip_bad: bool):
+        self._skip_bad = skip_bad
+        self.placed: list[Placed] = []
+        """Units that were taken, each with the number of its first episode."""
+        self.skipped: dict[str, str] = {}
+        self.left_out = 0
+        self.notes: dict[str, Mapping[str, Any]] = {}
+        self.about: dict[str, Any] = {}
+        self.recipe: dict[str, Any] = {}
+        self.units: dict[str, list[str]] = {}
+
+    def take(
+        self,
+        writer: DatasetWriter,
+        unit: Unit,
+        episodes: Sequence[PreparedEpisode],
+        error: InputError | None,
+        root: Path,
+    ) -> None:
+        """Append a unit's episodes, or all of them are left out."""
         try:
-            with progress("convert", len(paths)) as bar:
-                for path in paths:
-                    episode = read_episode(path)
-                    _check_fits(episode, path, first, paths[0])
-                    frames += _add(dataset, episode, recipe)
-                    bar.advance(note=f"{frames} frames")
-        finally:
-            try:
-                dataset.finalize()
-            finally:  # LeRobot's destructors would write again, into a folder that is gone
-                dataset.writer._finalized = dataset.meta._finalized = True
-        compared = _verify(part, out.name, paths, recipe, progress, dataset_class)
-        (part / MODEL).write_text(first.model_xml, encoding="utf-8")
-        hashes = {str(path): sha256(path) for path in paths}
-        facts = {"robot": meta.robot, "controller": meta.controller, "task": meta.task, "control_hz": meta.control_hz}
-        kept = {**meta.recipe, "convert": as_table(recipe)}
-        write_manifest(part, kind="dataset", recipe=kept, parents=hashes, seed=meta.seed, **facts)
-    return Converted(episodes=len(paths), frames=frames, compared=compared)
+            if error is not None:
+                raise error
+            for episode in episodes:
+                self._check_goes_with(episode)
+                writer.check_fits(episode)
+        except SKIPPABLE as wrong:
+            if not self._skip_bad:
+                raise
+            self.skipped[unit.key] = str(wrong)
+            return
+        if not episodes:
+            self.left_out += 1
+            return
+        self.placed.append((unit, writer.episodes))
+        for episode in episodes:
+            if not self.about:
+                self.about, self.recipe = dict(episode.about), dict(episode.recipe)
+                self.units = {name: list(units) for name, units in episode.units.items()}
+            if episode.notes:
+                self.notes[f"{writer.episodes} {episode.source}"] = episode.notes
+            if episode.model_xml and not (root / MODEL).is_file():
+                (root / MODEL).write_text(episode.model_xml, encoding="utf-8")
+            writer.add(episode)
+
+    def _check_goes_with(self, episode: PreparedEpisode) -> None:
+        for key, there in self.about.items():
+            here = episode.about.get(key)
+            if key != "task" and here != there:
+                raise DatasetError(
+                    f"{episode.source} has {key} {here}, the episodes before it have {there}; convert them into "
+                    "datasets of their own"
+                )
+        for name, there in self.units.items():
+            here = list(episode.units.get(name, there))
+            if here != there:
+                raise DatasetError(f"{episode.source} has {name} in {here}, the episodes before it in {there}")
 
 
-def verify(
-    dataset: Path, sources: list[Path], *, recipe: ConvertRecipe | None = None, progress: Progress = silent
-) -> int:
-    """Read a dataset and its recordings back and compare counts, numbers, tasks and episode boundaries.
-
-    Returns how many numbers were compared. Raises `VerificationError` at the first difference.
-    """
-    paths = recordings_in(sources)
-    recipe = recipe or _recipe_kept_in(read_episode(paths[0]), paths[0])
-    if not (dataset / "meta" / "info.json").is_file():
-        raise DatasetError(f"{dataset} is no LeRobot dataset: it has no meta/info.json")
-    with lerobot_datasets() as dataset_class:
-        return _verify(dataset, dataset.name, paths, recipe, progress, dataset_class)
+def _refuse_known(units: Sequence[Unit], manifest: Mapping[str, Any]) -> None:
+    known = {str(Path(path).resolve()) for path in manifest.get("parents", {})}
+    for unit in units:
+        for path in unit.paths:
+            if str(path.resolve()) in known:
+                raise DatasetError(f"{path} is in the dataset already; give only what is new")
 
 
-def _recipe_kept_in(episode: Episode, path: Path) -> ConvertRecipe:
-    table = episode.metadata.recipe.get("convert")
-    if table is None:
-        raise RecipeError(f"{path} was recorded by a recipe without a [convert] table; name one with --recipe")
-    return build(ConvertRecipe, table, f"{path} [convert]")
-
-
-def _check_fits(episode: Episode, path: Path, first: Episode, first_path: Path) -> None:
-    facts: list[tuple[str, Any, Any]] = [
-        (key, getattr(episode.metadata, key), getattr(first.metadata, key))
-        for key in ("robot", "controller", "control_hz")
-    ]
-    facts.append(("components", dict(episode.labels), dict(first.labels)))
-    for name, here, there in facts:
-        if here != there:
-            raise DatasetError(
-                f"{path} has {name} {here}, {first_path} has {there}; convert them into datasets of their own"
-            )
-    late = np.abs(episode.times - np.arange(len(episode) + 1) / episode.metadata.control_hz)
-    if late.max() > CLOCK_TOLERANCE_S:
-        at = int(late.argmax())
-        raise DatasetError(
-            f"{path}: the observation of step {at} stands at {episode.times[at]:.4f} s, "
-            f"{episode.metadata.control_hz} Hz puts it at {at / episode.metadata.control_hz:.4f} s"
-        )
-
-
-def _add(dataset: Any, episode: Episode, recipe: ConvertRecipe) -> int:
-    columns = columns_of(episode, recipe)
-    for t in range(len(episode)):
-        dataset.add_frame({key: values[t] for key, values in columns.items()} | {"task": episode.metadata.instruction})
-    dataset.save_episode()
-    return len(episode)
-
-
-def _verify(
-    root: Path, name: str, paths: list[Path], recipe: ConvertRecipe, progress: Progress, dataset_class: Any
-) -> int:
-    dataset = dataset_class(f"lfd/{name}", root=root, video_backend="pyav")
-    _compare("number of episodes", dataset.num_episodes, len(paths))
-    table = dataset.hf_dataset.with_format("numpy")
-    boundaries: Iterable[Mapping[str, Any]] = dataset.meta.episodes
-    at = compared = 0
-    with progress("verify", len(paths)) as bar:
-        for index, (path, boundary) in enumerate(zip(paths, boundaries, strict=True)):
-            episode = read_episode(path)
-            rows = table[at : at + len(episode)]
-            where = f"{path} as episode {index}"
-            span = (boundary["dataset_from_index"], boundary["dataset_to_index"])
-            _compare(f"{where}: rows", span, (at, at + len(episode)))
-            _compare(f"{where}: task", list(boundary["tasks"]), [episode.metadata.instruction])
-            _compare(f"{where}: episode_index", set(rows["episode_index"].tolist()), {index})
-            expected = columns_of(episode, recipe)
-            clock = {"timestamp": np.arange(len(episode), dtype=np.float32)[:, None] / dataset.fps}
-            for key, values in {**expected, **clock}.items():
-                read = np.asarray(rows[key]).reshape(values.shape)
-                if not np.array_equal(read, values.astype(read.dtype)):
-                    raise VerificationError(f"{where}: {key} differs from the recording; convert it again")
-                compared += read.size
-            at += len(episode)
-            bar.advance(note=f"{compared} numbers equal")
-    _compare("number of frames", dataset.num_frames, at)
-    return compared
-
-
-def _compare(what: str, read: Any, expected: Any) -> None:
-    if read != expected:
-        raise VerificationError(f"{what}: the dataset says {read}, the recordings say {expected}; convert them again")
+def _describe(root: Path, recipe: SourceRecipe, tally: _Tally, manifest: Mapping[str, Any]) -> None:
+    """Write the manifest: recipe, sources by hash, units, and what was left out."""
+    tables = tally.recipe | (manifest.get("recipe") or {}) | dict(recipe.tables)
+    about = {key: manifest.get(key, value) for key, value in tally.about.items()}
+    write_manifest(
+        root,
+        kind="dataset",
+        recipe=tables,
+        parents={**manifest.get("parents", {}), **hashes([unit for unit, _ in tally.placed])},
+        seed=tables.get("record", {}).get("seed", 0),
+        **about,
+        trust_rows=recipe.trust_rows,
+        units=manifest.get("units", {}) | tally.units,
+        skipped={**manifest.get("skipped", {}), **tally.skipped},
+        notes={**manifest.get("notes", {}), **tally.notes},
+    )

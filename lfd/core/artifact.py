@@ -5,6 +5,7 @@ which versions, seed and commit, so that any result can be traced to its recordi
 """
 
 import errno
+import glob
 import hashlib
 import json
 import os
@@ -116,19 +117,24 @@ def _foreign(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def new_folder(path: Path, *, overwrite: bool) -> Iterator[Path]:
+def new_folder(path: Path, *, overwrite: bool, grow: bool = False) -> Iterator[Path]:
     """A temporary folder beside `path` that takes its place when the block ends well, and is removed otherwise.
+
+    To `grow` a folder is to begin with what is in it: its files are linked, not copied, and must be replaced and not
+    changed. What a killed run left beside `path` is cleared away first.
 
     Raises `OutputError` when `path` exists and may not be replaced, or cannot be written.
     """
-    check_output(path, overwrite=overwrite)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    shutil.rmtree(part, ignore_errors=True)
+    _heal(path)
+    check_output(path, overwrite=overwrite or grow)
+    part = _beside(path, str(os.getpid()), "part")
     try:
         part.mkdir(parents=True)
+        if grow and path.is_dir():
+            shutil.copytree(path, part, copy_function=_link, dirs_exist_ok=True)
         yield part
         if path.exists():
-            old = path.with_name(f".{path.name}.{os.getpid()}.old")
+            old = _beside(path, str(os.getpid()), "old")
             path.rename(old)
             part.rename(path)
             shutil.rmtree(old)
@@ -140,6 +146,42 @@ def new_folder(path: Path, *, overwrite: bool) -> Iterator[Path]:
         raise OutputError(f"cannot write {path}: {error.strerror}; free space or choose another --out") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _beside(path: Path, process: str, what: str) -> Path:
+    return path.with_name(f".{path.name}.{process}.{what}")
+
+
+def _link(source: str, target: str) -> None:
+    """A second name for a file, or a copy where the file system has no links."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def _heal(path: Path) -> None:
+    """Undo what runs that were killed left: half-made folders, and a folder that was about to be replaced."""
+    if not path.parent.is_dir():
+        return
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*"):
+        process, _, what = left.name.removeprefix(f".{path.name}.").partition(".")
+        if what not in ("part", "old") or not process.isdecimal() or _is_running(int(process)):
+            continue
+        if what == "old" and not path.exists():
+            left.rename(path)
+        else:
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:  # somebody else's
+        return True
+    return True
 
 
 def packed(folder: Path) -> dict[str, bytes]:

@@ -80,6 +80,8 @@ class Episode:
     metadata: EpisodeMetadata
     model_xml: str = ""
     """The MuJoCo model, mesh paths starting with `robosuite/`."""
+    declared: bool | None = None
+    """Whether the recording says that it ended in success, where a person may have had the last word."""
     start_memory: Mapping[str, np.ndarray] | None = None
     """What the controllers remembered at the first observation; exact replay starts from it."""
 
@@ -124,5 +126,5 @@ class Episode:
 
     @property
     def success(self) -> bool:
-        """Whether the task was solved after the last step."""
-        return bool(self.successes[-1])
+        """Whether it ended in success: by what was declared, else by the simulation after the last step."""
+        return bool(self.successes[-1] if self.declared is None else self.declared)

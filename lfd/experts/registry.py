@@ -1,9 +1,12 @@
-"""The scripted experts by task."""
+"""The scripted experts by task, and the devices by which a person demonstrates."""
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 
-from lfd.core.errors import UnknownName
+from lfd.core.errors import InputError, UnknownName
 from lfd.core.protocols import Policy, WorldSpec
+from lfd.experts.device import Device, WithKeyboard
 from lfd.experts.lift import LiftExpert
 
 EXPERTS: dict[str, Callable[[WorldSpec], Policy]] = {
@@ -24,3 +27,51 @@ def make_expert(spec: WorldSpec) -> Policy:
     """
     check_expert(spec.task)
     return EXPERTS[spec.task](spec)
+
+
+def _keyboard() -> AbstractContextManager[Device]:
+    if sys.platform == "win32":
+        raise InputError("keys are read from a POSIX terminal: run lfd on Linux or macOS, or in WSL")
+    from lfd.experts.keyboard import open_keyboard
+
+    return open_keyboard()
+
+
+def _spacemouse() -> AbstractContextManager[Device]:
+    from lfd.experts.spacemouse import open_spacemouse
+
+    return open_spacemouse()
+
+
+def _gamepad() -> AbstractContextManager[Device]:
+    if sys.platform != "linux":
+        raise InputError(
+            f"gamepads are read through Linux' input events, this is {sys.platform}; use --device keyboard"
+        )
+    from lfd.experts.gamepad import open_gamepad
+
+    return open_gamepad()
+
+
+DEVICES: dict[str, Callable[[], AbstractContextManager[Device]]] = {
+    "keyboard": _keyboard,
+    "spacemouse": _spacemouse,
+    "gamepad": _gamepad,
+}
+"""Each module is imported when its device is opened: the libraries are not on every platform."""
+
+
+@contextmanager
+def open_device(name: str) -> Iterator[Device]:
+    """A device by its name, together with the keyboard of this terminal, which says the words that it cannot.
+
+    Raises `UnknownName` for a name that is no device, `InputError` when it is not there or may not be read.
+    """
+    if name not in DEVICES:
+        raise UnknownName("device", name, DEVICES)
+    if name == "keyboard":
+        with _keyboard() as keyboard:
+            yield keyboard
+    else:
+        with DEVICES[name]() as device, _keyboard() as keyboard:
+            yield WithKeyboard(device, keyboard)

@@ -25,7 +25,7 @@ def demo(
     Returns what `report.json` holds: success rate with its interval, episodes, and seconds of each stage.
     """
     check_output(out, overwrite=overwrite)
-    data = load_toml(dataset_recipe, ("record", "convert"))
+    data = load_toml(dataset_recipe, ("record", "convert", "video"))
     learn = load_toml(policy_recipe, ("policy", "train", "eval"))
     recipes = {
         "record": build(RecordRecipe, data.get("record", {}), f"{dataset_recipe} [record]"),

@@ -1,5 +1,6 @@
 """The record stage: demonstrations of a task, as many as the recipe asks for, one file each."""
 
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -7,13 +8,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lfd.core.artifact import check_output, packed, unpack, write_manifest
-from lfd.core.errors import LfdError, RecipeError
+from lfd.core.artifact import check_output, packed, read_manifest, unpack, write_manifest
+from lfd.core.errors import LfdError, OutputError, RecipeError
 from lfd.core.protocols import Policy, Progress, UnitMap, World, batches, silent
 from lfd.core.recipe import as_table
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.registry import check_expert, make_expert
 from lfd.record.episode_file import McapRecorder, Origin
+from lfd.record.journal import SUFFIX as JOURNAL
 from lfd.record.mcap_file import SUFFIX
 from lfd.worlds.robosuite_world import EVERY_CORE, RobosuiteWorld, kept_world, make_worlds
 from lfd.worlds.robots import RobotConfig, load_robot
@@ -21,6 +23,10 @@ from lfd.worlds.rollout import OneEach, Outcome, Start, episode_rng, rollouts
 from lfd.worlds.tasks import load_task
 
 STAGE = "record"
+EPISODE = "episode_"
+"""What names of recordings begin with, before the number of the attempt."""
+MAY_GROW = ("episodes", "attempts_per_episode")
+"""Keys of the recipe that may differ when a recording is gone on with."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +68,16 @@ class RecordRecipe:
             if getattr(self, key) < 0:
                 raise RecipeError(f"{where} {key} = {getattr(self, key)}: must not be negative")
 
+    @property
+    def horizon(self) -> int:
+        """Control steps after which a demonstration has failed."""
+        return round(self.max_seconds * self.control_hz)
+
+    @property
+    def hold_steps(self) -> int:
+        """Control steps for which the task must stay solved."""
+        return max(1, round(self.hold_seconds * self.control_hz))
+
 
 @dataclass(frozen=True)
 class Recorded:
@@ -84,6 +100,7 @@ def record(
     tables: Mapping[str, Any],
     most_worlds: int = EVERY_CORE,
     cluster: UnitMap | None = None,
+    resume: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Recorded:
@@ -93,11 +110,15 @@ def record(
     Worlds run in parallel, one a core, `most_worlds` at the most, or on the machines of a `cluster`; what is
     recorded does not depend on where, nor on how many.
     Failed attempts are counted and not kept; a recording has the number of its attempt. Episodes that are finished
-    stay whatever happens to the rest.
+    stay whatever happens to the rest; with `resume` those in `out` are not recorded again, and the folder ends as if
+    it had never been interrupted.
 
-    Raises `OutputError` when `out` holds something already, `LfdError` when too many attempts fail.
+    Raises `OutputError` when `out` holds something already, or was recorded by another recipe, `LfdError` when too many
+    attempts fail.
     """
-    check_output(out, overwrite=overwrite)
+    there = attempts_in(out, recipe, [key for key in as_table(recipe) if key not in MAY_GROW]) if resume else []
+    if not resume:
+        check_output(out, overwrite=overwrite)
     robot = load_robot(recipe.robot)  # names that are unknown show before anything is touched
     load_task(recipe.task)
     check_expert(recipe.task)
@@ -105,20 +126,20 @@ def record(
         most = min(most_worlds, recipe.episodes)
         worlds = make_worlds(recipe.task, recipe.robot, recipe.control_hz, most=most, progress=progress)
         for world in worlds:
-            _take_cameras(world, recipe)
+            take_cameras(world, recipe)
     else:
         worlds = []
-    out.mkdir(parents=True, exist_ok=True)
-    for old in (*out.glob(f"*{SUFFIX}"), *out.glob(f"*{SUFFIX}.part")):
-        old.unlink()
     used = {**tables, "record": as_table(recipe)}
-    write_manifest(out, kind="recordings", recipe=used, parents={}, seed=recipe.seed)
-    began, tally = time.perf_counter(), _Tally(recipe.episodes, recipe.attempts_per_episode * recipe.episodes)
+    if not resume:
+        begin_recordings(out, used, recipe.seed)
+    most_attempts = recipe.attempts_per_episode * recipe.episodes
+    began, tally = time.perf_counter(), _Tally(recipe.episodes, most_attempts, frozenset(there))
     if cluster is None:
         ended = _attempt(worlds, recipe, used, tally.next_attempt, out)
     else:
         ended = _attempt_on(cluster, robot, recipe, used, tally, out)
     with progress(f"record {recipe.task}", recipe.episodes) as bar:
+        bar.advance(len(there), note=f"{len(there)} were there")
         for outcome in ended:
             tally.end(outcome)
             rate = tally.steps / (time.perf_counter() - began)
@@ -127,6 +148,41 @@ def record(
         raise LfdError(f"{tally.failed} of {tally.attempts} attempts failed; {tally.kept} demonstrations are in {out}")
     rate = tally.steps / (time.perf_counter() - began)
     return Recorded(tally.kept, tally.failed, tally.steps, tally.clipped, round(rate, 1))
+
+
+def attempts_in(out: Path, recipe: RecordRecipe, same: Sequence[str]) -> list[int]:
+    """Numbers of the attempts that are recorded in a folder which is to be gone on with.
+
+    Raises `OutputError` when it holds none, or when they were made by a recipe that differs in one of the keys `same`.
+    """
+    manifest = read_manifest(out) if out.is_dir() else None
+    if manifest is None:
+        raise OutputError(f"{out} holds no recordings to go on with; leave --resume out to begin there")
+    before, now = manifest["recipe"].get("record", {}), as_table(recipe)
+    for key in same:
+        if before.get(key) != now[key]:
+            raise OutputError(
+                f"{out} was recorded with {key} = {before.get(key)!r}, the recipe says {now[key]!r}; "
+                "go on with the same recipe, or choose another --out"
+            )
+    names = (re.match(rf"{EPISODE}(\d+){re.escape(SUFFIX)}$", path.name) for path in out.iterdir())
+    return sorted(int(name[1]) for name in names if name)
+
+
+def begin_recordings(out: Path, used: Mapping[str, Any], seed: int) -> None:
+    """Make `out` an empty folder of recordings; `used` is the recipe as it is used."""
+    out.mkdir(parents=True, exist_ok=True)
+    for old in (p for ending in ("", ".part", JOURNAL) for p in out.glob(f"*{SUFFIX}{ending}")):
+        old.unlink()
+    write_manifest(out, kind="recordings", recipe=used, parents={}, seed=seed)
+
+
+def make_recorder(
+    out: Path, used: Mapping[str, Any], *, policy: str, seed: int, attempt: int, keep_failures: bool
+) -> McapRecorder:
+    """What records attempt number `attempt` of a policy into the folder `out`."""
+    origin = Origin(stage=STAGE, policy=policy, seed=seed, index=attempt, recipe=used)
+    return McapRecorder(out / f"{EPISODE}{attempt:06d}{SUFFIX}", origin, keep_failures=keep_failures)
 
 
 def _attempt(
@@ -143,17 +199,12 @@ def _attempt(
         attempt = next_attempt()
         if attempt is None:
             return None
-        origin = Origin(stage=STAGE, policy=policies[0].name, seed=recipe.seed, index=attempt, recipe=used)
-        recorder = McapRecorder(out / f"episode_{attempt:06d}{SUFFIX}", origin, keep_failures=False)
+        recorder = make_recorder(
+            out, used, policy=policies[0].name, seed=recipe.seed, attempt=attempt, keep_failures=False
+        )
         return Start(index=attempt, rng=episode_rng(STAGE, recipe.seed, attempt), observers=[recorder])
 
-    ended = rollouts(
-        worlds,
-        OneEach(policies),
-        next_start,
-        horizon=round(recipe.max_seconds * recipe.control_hz),
-        hold_steps=max(1, round(recipe.hold_seconds * recipe.control_hz)),
-    )
+    ended = rollouts(worlds, OneEach(policies), next_start, horizon=recipe.horizon, hold_steps=recipe.hold_steps)
     for _, outcome in ended:
         yield outcome
 
@@ -175,7 +226,7 @@ def _unit(
     """A worker's part of a recording: outcomes, and recordings by name."""
     robot, recipe, used = shared
     world, waiting = kept_world(recipe.task, recipe.robot, robot, recipe.control_hz), iter(attempts)
-    _take_cameras(world, recipe)
+    take_cameras(world, recipe)
     with TemporaryDirectory() as folder:
         outcomes = list(_attempt([world], recipe, used, lambda: next(waiting, None), Path(folder)))
         return outcomes, packed(Path(folder))
@@ -191,6 +242,8 @@ class _Tally:
 
     wanted: int
     most: int
+    there: frozenset[int] = frozenset()
+    """Attempts that succeeded before."""
     attempts: int = 0
     kept: int = 0
     failed: int = 0
@@ -198,17 +251,20 @@ class _Tally:
     clipped: int = 0
 
     def next_attempt(self) -> int | None:
-        if self.attempts - self.failed >= self.wanted or self.attempts >= self.most:
-            return None
-        self.attempts += 1
-        return self.attempts - 1
+        while self.attempts - self.failed < self.wanted and self.attempts < self.most:
+            self.attempts += 1
+            if self.attempts - 1 not in self.there:
+                return self.attempts - 1
+            self.kept += 1
+        return None
 
     def end(self, outcome: Outcome) -> None:
         self.steps, self.clipped = self.steps + outcome.steps, self.clipped + outcome.clipped
         self.kept, self.failed = self.kept + outcome.success, self.failed + (not outcome.success)
 
 
-def _take_cameras(world: RobosuiteWorld, recipe: RecordRecipe) -> None:
+def take_cameras(world: RobosuiteWorld, recipe: RecordRecipe) -> None:
+    """Have a world take the pictures that a recipe asks for."""
     if recipe.cameras and world.spec.cameras != recipe.cameras:
         world.take_cameras(recipe.cameras, height=recipe.camera_height, width=recipe.camera_width)
 

@@ -18,14 +18,14 @@ from lfd.core.artifact import versions
 from lfd.core.channels import ARRAY, CHANNELS, IMAGE, JOINT_STATE, POSE, channel
 from lfd.core.episode import Episode, EpisodeMetadata
 from lfd.core.errors import EpisodeError, RecordingError
-from lfd.core.protocols import Decision, Observation, Transition, World, WorldState
+from lfd.core.protocols import Observation, Transition, World, WorldState
 from lfd.core.rotations import wxyz_from_xyzw
 from lfd.record import cdr
 from lfd.record.columns import arrays, joint_states, poses
-from lfd.record.layouts import BlockMessage, StepBlock
-from lfd.record.mcap_file import DAMAGE, SUFFIX, McapContent, read_mcap
+from lfd.record.journal import Journal, journal_of
+from lfd.record.mcap_file import DAMAGE, SUFFIX, McapContent, metadata_of, read_mcap
 from lfd.record.mcap_writing import McapWriter
-from lfd.record.messages import Labels, step_messages
+from lfd.record.messages import Components, Labels, step_messages
 from lfd.record.png import encode_png
 
 FORMAT = "1"
@@ -80,7 +80,10 @@ class McapRecorder:
         state = world.get_state()
         self._observed = [name for name in self._labels if name != "action"]
         self._key, self._sim_size = tuple(self._labels.items()), len(state.sim)
-        self._blocks: dict[Any, tuple[StepBlock, np.ndarray]] = {}
+        self._journal: Journal | None = None
+        """Steps that are not in the file yet."""
+        self._kind: tuple[bool, Components] = False, ()
+        """Whether those steps have an expert's action, and which signals."""
         first = step_messages(self._key, self._sim_size, has_expert=False, signals=()).late[1:]
         for message in first:
             self._writer.channel(message.topic, message.schema, message.about)
@@ -101,46 +104,67 @@ class McapRecorder:
         decision, result = transition.decision, transition.result
         now = self._start_ns + round(transition.step * 1e9 / self._hz)
         then = self._start_ns + round((transition.step + 1) * 1e9 / self._hz)
-        parts = [result.observation[name] for name in self._observed]
-        parts += [world.sim_state(), (result.reward, result.success, transition.done, decision.intervention)]
-        parts.append(decision.action)
+        numbers = [result.observation[name] for name in self._observed]
+        numbers += [world.sim_state(), (result.reward, result.success, transition.done, decision.intervention)]
+        numbers.append(decision.action)
         if decision.expert_action is not None:
-            parts.append(decision.expert_action)
-        parts += [list(components.values()) for components in decision.signals.values()]
-        block, places = self._block(decision)
-        records = block.fill(np.concatenate(parts)[places], (now, then))
-        times = [then if late else now for late in block.late]
-        self._writer.block(records, block.channels, block.offsets, times)
+            numbers.append(decision.expert_action)
+        numbers += [list(components.values()) for components in decision.signals.values()]
+        signals = tuple((name, tuple(components)) for name, components in decision.signals.items())
+        kind = decision.expert_action is not None, signals
+        if self._journal is None or kind != self._kind:
+            self._begin_journal(kind)
+        assert self._journal is not None
+        self._journal.add(transition.step, (now, then), numbers)
+        if self._journal.is_full:
+            self._write_waiting()
         self._write_pictures(then, world)
         self._steps, self._reward = transition.step + 1, self._reward + result.reward
         self._failure = result.failure
 
     def end(self, success: bool) -> None:
         if not success and not self._keep_failures:
-            self._writer.discard()
+            self.abort()
             return
+        self._write_waiting()
         now = self._start_ns + round(self._steps * 1e9 / self._hz)
         self._event(now, "episode_end", success=success, steps=self._steps, failure=self._failure)
         facts = {"steps": self._steps, "success": success, "reward": self._reward, "failure": self._failure}
         self._writer.metadata(END, {key: json.dumps(value) for key, value in facts.items()})
         self._writer.finish()
+        self._end_journal()
 
     def abort(self) -> None:
         if hasattr(self, "_writer"):
             self._writer.discard()
+            if self._journal is not None:
+                self._journal.remove()
+                self._journal = None
 
-    def _block(self, decision: Decision) -> tuple[StepBlock, np.ndarray]:
-        """The block of a step's messages, and the places of its numbers."""
-        has_expert = decision.expert_action is not None
-        signals = tuple((name, tuple(components)) for name, components in decision.signals.items())
-        if (has_expert, signals) not in self._blocks:
-            made = step_messages(self._key, self._sim_size, has_expert=has_expert, signals=signals)
-            messages = [(message, False) for message in made.early] + [(message, True) for message in made.late]
-            for message, _ in messages:
-                self._writer.channel(message.topic, message.schema, message.about)
-            block = StepBlock([BlockMessage(self._writer.number(m.topic), m.layout, late) for m, late in messages])
-            self._blocks[has_expert, signals] = block, np.concatenate([m.places for m, _ in messages])
-        return self._blocks[has_expert, signals]
+    def _begin_journal(self, kind: tuple[bool, Components]) -> None:
+        """Have a journal for steps with or without an expert's action, and with some signals."""
+        self._end_journal()
+        has_expert, signals = self._kind = kind
+        about = {"has_expert": has_expert, "signals": signals, "sim_size": self._sim_size}
+        self._messages = step_messages(self._key, self._sim_size, has_expert=has_expert, signals=signals)
+        for message in self._messages.all:
+            self._writer.channel(message.topic, message.schema, message.about)
+        self._block = self._messages.block(tuple(self._writer.number(m.topic) for m in self._messages.all))
+        self._journal = Journal(journal_of(self._path), self._messages.size, about)
+
+    def _write_waiting(self) -> None:
+        """Write the steps that wait, at a time: together they cost little more than one of them."""
+        if self._journal is not None and self._journal.count:
+            numbers, times = self._journal.take()
+            self._writer.records(self._block.fill(numbers[:, self._messages.places], times))
+            self._writer.flush()
+            self._journal.clear()
+
+    def _end_journal(self) -> None:
+        if self._journal is not None:
+            self._write_waiting()
+            self._journal.remove()
+            self._journal = None
 
     def _event(self, now: int, event: str, **facts: Any) -> None:
         self._writer.message("/events", now, cdr.pack_log(now, json.dumps({"event": event, **facts})))
@@ -168,7 +192,19 @@ def read_episode(path: Path) -> Episode:
     Raises `RecordingError` for a file that is damaged, of another schema or incomplete, naming the file and
     the topic, and `EpisodeError` for numbers that are no episode.
     """
-    content = read_mcap(path)
+    return episode_of(read_mcap(path), path)
+
+
+def recipe_in(path: Path) -> dict[str, Any]:
+    """The recipe that a recording keeps; nothing for a file that is none, or cannot be read."""
+    try:
+        return json.loads(metadata_of(path).get(BEGIN, {}).get("recipe", "{}"))
+    except RecordingError:
+        return {}
+
+
+def episode_of(content: McapContent, path: Path) -> Episode:
+    """The episode in the content of the file `path`; raises what `read_episode` does."""
     if BEGIN not in content.metadata:
         raise RecordingError(f"{path} is an MCAP file, but no episode of lfd: it has no metadata {BEGIN!r}")
     if END not in content.metadata:
@@ -215,6 +251,7 @@ def _decode(content: McapContent, about: dict[str, str]) -> Episode:
         labels=labels,
         metadata=EpisodeMetadata(**metadata),
         model_xml=content.attachments[MODEL].decode(),
+        declared=json.loads(content.metadata[END].get("success", "null")),
         start_memory=_memory(content.attachments.get(MEMORY)),
     )
 

@@ -7,10 +7,12 @@ copying its numbers into a block of bytes, and a whole topic is read by one inde
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from lfd.record.mcap_chunk import Records
 from lfd.record.mcap_writing import MESSAGE_HEAD
 
 Pack = Callable[[int, Float[np.ndarray, "F"]], bytes]
@@ -70,7 +72,7 @@ class BlockMessage:
 
 
 class StepBlock:
-    """The message records of a control step, always the same but for numbers and stamps.
+    """The message records of a control step, always the same but for numbers and stamps; filled for some steps at once.
 
     A step has two times: that of its action and that of the observation after it.
     """
@@ -79,8 +81,6 @@ class StepBlock:
         parts, numbers, at = [], [], 0
         stamps: tuple[list[np.ndarray], list[np.ndarray]] = [], []
         clocks: tuple[list[np.ndarray], list[np.ndarray]] = [], []
-        self.channels = tuple(m.channel for m in messages)
-        self.late = tuple(m.late for m in messages)
         offsets = []
         for message in messages:
             body = message.layout
@@ -91,18 +91,32 @@ class StepBlock:
             stamps[message.late].append(at + len(head) + body.stamps)
             parts += [head, body.template]
             at += len(head) + len(body.template)
-        self.offsets = tuple(offsets)
+        self._channels = np.array([m.channel for m in messages], dtype=np.uint16)
+        self._late = np.array([m.late for m in messages], dtype=int)
+        self._offsets = np.array(offsets)
         self._bytes = np.concatenate(parts)
-        self._numbers = np.concatenate(numbers)
+        self._runs = _runs(np.concatenate(numbers)[::8])
         none = np.empty((0, 8), dtype=int)
         self._stamps = [np.concatenate([none, *places]) for places in stamps]
         self._clocks = [np.concatenate([none, *places]) for places in clocks]
 
-    def fill(self, numbers: Float[np.ndarray, "F"], times_ns: tuple[int, int]) -> bytes:
-        """The records with the numbers of all messages, one after the other, and their two times."""
-        block = self._bytes
-        block[self._numbers] = numbers.view(np.uint8)
-        for time_ns, stamps, clocks in zip(times_ns, self._stamps, self._clocks, strict=True):
-            block[stamps] = np.array(divmod(time_ns, 10**9), dtype="<u4").view(np.uint8)
-            block[clocks] = np.array([time_ns], dtype="<u8").view(np.uint8)
-        return block.tobytes()
+    def fill(self, numbers: Float[np.ndarray, "N F"], times_ns: Int[np.ndarray, "N 2"]) -> "Records":
+        """The records of N steps: the numbers of all messages, one after the other, and the two times of each step."""
+        steps = len(numbers)
+        block = np.tile(self._bytes, (steps, 1))
+        content = np.ascontiguousarray(numbers).view(np.uint8)
+        for place, begin, end in self._runs:
+            block[:, place : place + end - begin] = content[:, begin:end]
+        for times, stamps, clocks in zip(times_ns.T, self._stamps, self._clocks, strict=True):
+            split = np.stack(np.divmod(times, 10**9), axis=1).astype("<u4").view(np.uint8)
+            block[:, stamps] = split[:, None]
+            block[:, clocks] = np.ascontiguousarray(times).astype("<u8").view(np.uint8).reshape(steps, 1, 8)
+        offsets = len(self._bytes) * np.arange(steps)[:, None] + self._offsets
+        channels = np.tile(self._channels, steps)
+        return Records(block.tobytes(), channels, offsets.reshape(-1), times_ns[:, self._late].reshape(-1))
+
+
+def _runs(places: Int[np.ndarray, "F"]) -> list[tuple[int, int, int]]:
+    """Runs of numbers that stand side by side: place of the first, and which bytes of all numbers they are."""
+    edges = [0, *(np.flatnonzero(np.diff(places) != 8) + 1).tolist(), len(places)]
+    return [(int(places[begin]), 8 * begin, 8 * end) for begin, end in pairwise(edges) if begin < end]

@@ -11,6 +11,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, DataEnd, Metadata, Schema, Statistics
+from mcap.records import Attachment, Channel, DataEnd, Footer, Metadata, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from lfd.core.errors import RecordingError
@@ -34,6 +35,10 @@ CHUNK_HEAD = struct.Struct("<QQQII")
 """First and last log time, uncompressed size, checksum, length of the compression's name."""
 MOST_UNPACKED = 64, 64 * 2**20
 """A chunk may unpack to so many times its size, or to so many bytes, whichever is more."""
+
+
+UNKNOWN_SIZE = -1
+"""What zstandard answers for a frame that does not say its size."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,8 @@ class McapContent:
     """Topic to (log time [ns], data), in the order of time."""
     topics: dict[str, Topic] = field(default_factory=dict)
     """Topic to what the file says of it; also of topics without a message."""
+    jumps: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Topic whose clock ran back in the file to the log times [ns] before and after the first jump."""
     metadata: dict[str, Mapping[str, str]] = field(default_factory=dict)
     attachments: dict[str, bytes] = field(default_factory=dict)
 
@@ -91,6 +98,22 @@ def read_mcap(path: Path) -> McapContent:
             f"{path} is truncated, damaged or no MCAP file ({reason}); record the episode again, leave the file out, "
             f"or save what is whole with `lfd recover {path.parent}`"
         ) from error
+
+
+def metadata_of(path: Path) -> Mapping[str, Mapping[str, str]]:
+    """The metadata that stand before the messages of a file, without reading those.
+
+    Raises `RecordingError` for a file that is damaged before them.
+    """
+    data, reading = memoryview(_bytes_of(path)), _Reading()
+    try:
+        for opcode, begin, end in _records(data, len(MAGIC)):
+            if opcode in (Opcode.CHUNK, Opcode.DATA_END):
+                break
+            reading.take(opcode, data[begin:end])
+    except DAMAGE as error:
+        raise RecordingError(f"{path} is truncated, damaged or no MCAP file ({error})") from error
+    return reading.content(check=False).metadata
 
 
 def salvage_mcap(path: Path) -> tuple[McapContent, int]:
@@ -193,8 +216,17 @@ class _Reading:
             check = DataEnd.read(_stream(content)).data_section_crc
             if check and zlib.crc32(before) != check:
                 raise ValueError("the checksum of the file is wrong")
+        elif opcode == Opcode.FOOTER and before is not None:
+            self._check_summary(content, before)
         elif opcode == Opcode.STATISTICS:
             self._expected = Statistics.read(_stream(content)).message_count
+
+    def _check_summary(self, content: memoryview, before: memoryview) -> None:
+        """Compare the checksum that the footer has of the summary and of itself."""
+        footer = Footer.read(_stream(content))
+        head = RECORD_HEAD.pack(Opcode.FOOTER, len(content)) + bytes(content[:16])
+        if footer.summary_crc and zlib.crc32(head, zlib.crc32(before[footer.summary_start :])) != footer.summary_crc:
+            raise ValueError("the checksum of the summary is wrong")
 
     def _take_message(self, data: memoryview, begin: int, end: int) -> None:
         number, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, begin)
@@ -213,12 +245,24 @@ class _Reading:
         for number, channel in self.channels.items():
             schema = self._schemas.get(channel.schema_id)
             told = (schema.name, schema.encoding, schema.data) if schema else ("", "", b"")
-            content.topics.setdefault(channel.topic, Topic(channel.message_encoding, *told, channel.metadata))
+            topic = Topic(channel.message_encoding, *told, channel.metadata)
+            first = content.topics.setdefault(channel.topic, topic)
+            if (first.schema, first.encoding) != (topic.schema, topic.encoding):
+                raise ValueError(f"topic {channel.topic} has messages of two types, {first.schema} and {topic.schema}")
             if number in self._messages:
+                _note_jump(content, channel.topic, self._messages[number])
                 content.messages.setdefault(channel.topic, []).extend(self._messages[number])
         for messages in content.messages.values():
             messages.sort(key=lambda message: message[0])
         return content
+
+
+def _note_jump(content: McapContent, topic: str, messages: list[tuple[int, bytes]]) -> None:
+    """Note where the log times of a channel run back."""
+    for (before, _), (after, _) in pairwise(messages):
+        if after < before:
+            content.jumps.setdefault(topic, (before, after))
+            return
 
 
 def _stream(content: memoryview) -> ReadDataStream:
@@ -239,7 +283,7 @@ def _unpack_chunk(content: memoryview) -> memoryview:
         raise ValueError(f"a chunk of {length} bytes claims to unpack to {size}")
     data: Any
     if compression == "zstd":
-        if zstandard.frame_content_size(packed) not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+        if zstandard.frame_content_size(packed) not in (size, UNKNOWN_SIZE):
             raise ValueError("a chunk's sizes contradict each other")
         data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
     elif compression == "lz4":

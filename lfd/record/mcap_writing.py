@@ -12,9 +12,10 @@ of a step can be handed over as one block of bytes (`lfd.record.step_block`).
 import os
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +26,6 @@ from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    Chunk,
-    ChunkIndex,
     DataEnd,
     Footer,
     Header,
@@ -36,18 +35,23 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdCompressor
+from mcap.writer import MCAP0_MAGIC, Writer
 
 from lfd.core.artifact import UNWRITABLE
 from lfd.core.errors import OutputError
 from lfd.record.cdr import schema_text
+from lfd.record.mcap_chunk import OpenChunk, PackedChunk, Records
 
 CHUNK_BYTES = 256 * 1024
 FLUSH_NS = 400_000_000
 """Longest time between the first and the last message that wait in memory [ns], but for the last step."""
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence number (not used), log time, publish time."""
+
+
+def library_writer(stream: Any) -> Writer:
+    """The library's own writer, to compare with."""
+    return Writer(stream, chunk_size=CHUNK_BYTES)
 
 
 class McapWriter:
@@ -65,11 +69,9 @@ class McapWriter:
             raise OutputError(f"cannot write {self._part}: {error.strerror}; choose another --out") from error
         self._schemas: dict[str, Schema] = {}
         self._channels: dict[str, Channel] = {}
-        self._chunk, self._compressor = _OpenChunk(), ZstdCompressor(level=1)
-        self._chunks: list[ChunkIndex] = []
+        self._chunk, self._chunks = OpenChunk(), list[PackedChunk]()
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self._counts: dict[int, int] = {}
         self._crc = self._at = 0
         with self._writing():
             self._put(MCAP0_MAGIC)
@@ -97,16 +99,17 @@ class McapWriter:
         """Append a message."""
         number = self._channels[topic].id
         head = MESSAGE_HEAD.pack(Opcode.MESSAGE, 22 + len(data), number, 0, time_ns, time_ns)
-        self.block(head + data, (number,), (0,), (time_ns,))
+        one = np.array([number], dtype=np.uint16), np.array([0]), np.array([time_ns])
+        self.records(Records(head + data, *one))
 
-    def block(self, records: bytes, channels: Sequence[int], offsets: Sequence[int], times_ns: Sequence[int]) -> None:
-        """Append several message records at once: the channel, place in `records` and log time of each."""
-        chunk, first, last = self._chunk, min(times_ns), max(times_ns)
-        if chunk.channels and (
-            max(last, chunk.last) - chunk.first > FLUSH_NS or len(chunk.data) + len(records) > CHUNK_BYTES
+    def records(self, records: Records) -> None:
+        """Append several messages at once."""
+        chunk = self._chunk
+        if chunk.records and (
+            records.times_ns[-1] - chunk.first > FLUSH_NS or chunk.size + len(records.data) > CHUNK_BYTES
         ):
             self.flush()
-        chunk.add(records, channels, offsets, times_ns, first, last)
+        chunk.add(records)
 
     def flush(self) -> None:
         """Hand everything to the operating system."""
@@ -165,52 +168,34 @@ class McapWriter:
         return at, len(data)
 
     def _write_chunk(self) -> None:
-        chunk = self._chunk
-        if not chunk.channels:
+        if not self._chunk.records:
             return
-        data = bytes(chunk.data)
-        packed = self._compressor.compress(data)
-        place = self._record(Chunk("zstd", packed, chunk.last, chunk.first, zlib.crc32(data), len(data)))
-        begin, index, offsets = self._at, bytearray(), {}
-        for number, entries in chunk.index().items():
-            offsets[number] = begin + len(index)
-            index += struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries.nbytes, number, entries.nbytes)
-            index += entries.tobytes()
-            self._counts[number] = self._counts.get(number, 0) + len(entries)
-        self._put(bytes(index))
-        self._chunks.append(
-            ChunkIndex(
-                chunk_start_offset=place[0],
-                chunk_length=place[1],
-                compression="zstd",
-                compressed_size=len(packed),
-                uncompressed_size=len(data),
-                message_start_time=chunk.first,
-                message_end_time=chunk.last,
-                message_index_offsets=offsets,
-                message_index_length=len(index),
-            )
-        )
-        chunk.clear()
+        packed = self._chunk.pack(self._at)
+        self._put(packed.data)
+        self._chunks.append(packed)
+        self._chunk.clear()
 
     def _write_summary(self) -> None:
         start, builder = self._at, RecordBuilder()
+        counts = Counter[int]()
+        for chunk in self._chunks:
+            counts.update(chunk.counts)
         statistics = Statistics(
             attachment_count=len(self._attachments),
             channel_count=len(self._channels),
-            channel_message_counts=self._counts,
+            channel_message_counts=counts,
             chunk_count=len(self._chunks),
-            message_count=sum(self._counts.values()),
+            message_count=counts.total(),
             metadata_count=len(self._metadata),
-            message_start_time=min((c.message_start_time for c in self._chunks), default=0),
-            message_end_time=max((c.message_end_time for c in self._chunks), default=0),
+            message_start_time=min((chunk.first for chunk in self._chunks), default=0),
+            message_end_time=max((chunk.last for chunk in self._chunks), default=0),
             schema_count=len(self._schemas),
         )
         groups: Mapping[Opcode, Sequence[Any]] = {
             Opcode.SCHEMA: list(self._schemas.values()),
             Opcode.CHANNEL: list(self._channels.values()),
             Opcode.STATISTICS: [statistics],
-            Opcode.CHUNK_INDEX: self._chunks,
+            Opcode.CHUNK_INDEX: [_Written(chunk.index) for chunk in self._chunks],
             Opcode.ATTACHMENT_INDEX: self._attachments,
             Opcode.METADATA_INDEX: self._metadata,
         }
@@ -240,42 +225,11 @@ class McapWriter:
             ) from error
 
 
-class _OpenChunk:
-    """Messages that wait to be written."""
+@dataclass(frozen=True)
+class _Written:
+    """A record that is put together already."""
 
-    def __init__(self) -> None:
-        self.data = bytearray()
-        self.clear()
+    data: bytes
 
-    def clear(self) -> None:
-        self.data.clear()
-        self.channels: list[int] = []
-        self._places: list[int] = []
-        self._times: list[int] = []
-        self.first = self.last = 0
-
-    def add(
-        self,
-        records: bytes,
-        channels: Sequence[int],
-        offsets: Sequence[int],
-        times_ns: Sequence[int],
-        first: int,
-        last: int,
-    ) -> None:
-        begin = len(self.data)
-        self.first = min(self.first, first) if self.channels else first
-        self.last = max(self.last, last) if self.channels else last
-        self.channels += channels
-        self._places += [begin + offset for offset in offsets]
-        self._times += times_ns
-        self.data += records
-
-    def index(self) -> dict[int, np.ndarray]:
-        """Channel to rows of (log time [ns], place in the chunk)."""
-        channels = np.array(self.channels, dtype=np.uint16)
-        order = np.argsort(channels, kind="stable")
-        entries = np.array([self._times, self._places], dtype="<u8").T[order]
-        ends = np.cumsum(np.bincount(channels)).tolist()
-        found = {number: entries[begin:end] for number, (begin, end) in enumerate(pairwise(ends), start=1)}
-        return {number: rows for number, rows in found.items() if len(rows)}
+    def write(self, builder: RecordBuilder) -> None:
+        builder.write(self.data)

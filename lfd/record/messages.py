@@ -14,7 +14,7 @@ from jaxtyping import Int
 from lfd.core.channels import ARRAY, CHANNELS, POSE, channel
 from lfd.core.rotations import xyzw_from_wxyz
 from lfd.record.columns import array_pack, joint_state_pack, pose_pack, transforms_pack
-from lfd.record.layouts import Layout, Pack
+from lfd.record.layouts import BlockMessage, Layout, Pack, StepBlock
 
 STEP = "step"
 """Key of the numbers that belong to the step itself."""
@@ -44,7 +44,7 @@ class StepMessage:
         return Layout.of(self.pack, len(self.places))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class StepMessages:
     """All messages of a step."""
 
@@ -52,6 +52,25 @@ class StepMessages:
     """Those at the time of the decision."""
     late: Sequence[StepMessage]
     """Those at the time of the observation after it."""
+
+    size: int
+    """Numbers of the flat vector."""
+
+    @property
+    def all(self) -> list[StepMessage]:
+        return [*self.early, *self.late]
+
+    @cached_property
+    def places(self) -> Int[np.ndarray, "F"]:
+        """Places of all their numbers, message after message, in the flat vector of the step."""
+        return np.concatenate([message.places for message in self.all])
+
+    @lru_cache(maxsize=4)  # noqa: B019  one of these lives as long as its world's kind
+    def block(self, numbers: tuple[int, ...]) -> StepBlock:
+        """Their records in a file where their topics have these numbers."""
+        late = [False] * len(self.early) + [True] * len(self.late)
+        messages = zip(numbers, self.all, late, strict=True)
+        return StepBlock([BlockMessage(number, m.layout, is_late) for number, m, is_late in messages])
 
 
 Components = tuple[tuple[str, tuple[str, ...]], ...]
@@ -73,6 +92,7 @@ def step_messages(labels: Components, sim_size: int, *, has_expert: bool, signal
         | {name: len(components) for name, components in signals}
     )
     return StepMessages(
+        size=sum(map(len, at.values())),
         early=_decision_messages(names, at, has_expert=has_expert, signals=dict(signals)),
         late=[_step_message(at), *_observation_messages(names, at)],
     )

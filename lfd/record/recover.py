@@ -16,8 +16,10 @@ from lfd.core.errors import EpisodeError, RecordingError
 from lfd.core.protocols import Progress, silent
 from lfd.record.columns import arrays
 from lfd.record.episode_file import BEGIN, END, MEMORY, read_episode
-from lfd.record.mcap_file import DAMAGE, SUFFIX, McapContent, salvage_mcap
+from lfd.record.journal import LeftSteps, journal_of, read_journal
+from lfd.record.mcap_file import DAMAGE, SUFFIX, McapContent, Topic, salvage_mcap
 from lfd.record.mcap_writing import McapWriter
+from lfd.record.messages import step_messages
 
 PART = f"{SUFFIX}.part"
 RECOVERED = f".recovered{SUFFIX}"
@@ -80,6 +82,7 @@ def _recover_file(path: Path) -> Recovered:
         return _nothing(path, f"{target.name} is there already; move one of them away")
     try:
         content, lost = salvage_mcap(path)
+        _add_left_steps(content, read_journal(journal_of(target)))
         steps = _steps_of(content)
     except (RecordingError, *DAMAGE) as error:
         return _nothing(path, str(error))
@@ -96,9 +99,32 @@ def _recover_file(path: Path) -> Recovered:
     else:
         made.rename(target)
         path.unlink()
+        journal_of(target).unlink(missing_ok=True)
     return Recovered(
         path=str(path), episode=str(target), steps=end - begin, dropped_steps=dropped, lost_bytes=lost, note=note
     )
+
+
+def _add_left_steps(content: McapContent, left: LeftSteps | None) -> None:
+    """Add the messages of the steps that a killed recording had not written yet."""
+    if left is None or BEGIN not in content.metadata:
+        return
+    labels = tuple((name, tuple(names)) for name, names in json.loads(content.metadata[BEGIN]["labels"]).items())
+    about = left.about
+    signals = tuple((name, tuple(components)) for name, components in about["signals"])
+    made = step_messages(labels, about["sim_size"], has_expert=about["has_expert"], signals=signals)
+    written = {stamp for stamp, _ in content.messages.get(CHANNELS["reward"].topic, [])}
+    for _, now, then, numbers in left.rows:
+        if then in written or len(numbers) != made.size:
+            continue
+        for messages, stamp in ((made.early, now), (made.late, then)):
+            for message in messages:
+                told = Topic("cdr", message.schema, "ros2msg", b"", message.about)
+                content.topics.setdefault(message.topic, told)
+                data = message.pack(stamp, numbers[message.places])
+                content.messages.setdefault(message.topic, []).append((stamp, data))
+    for rows in content.messages.values():
+        rows.sort(key=lambda row: row[0])
 
 
 def _nothing(path: Path, why: str) -> Recovered:

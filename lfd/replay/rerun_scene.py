@@ -1,4 +1,4 @@
-"""Clips in Rerun. The only module that imports rerun.
+"""Clips in Rerun. This module and `rerun_live` are the only ones that import rerun.
 
 Meshes are logged once, without time; what moves are the transforms of their bodies, sent as columns.
 """
@@ -21,6 +21,8 @@ SHAPES = mujoco.mjtGeom
 HIDDEN = ("wall", "floor")
 FIRST_PLOTS = ("plots/action/applied", "plots/joints/position", "plots/gripper/position")
 PATH_COLORS = {"ee": (60, 130, 246)}
+EYE = (1.05, -0.85, 1.45)
+"""From where a clip is seen [m]: the robot's front and right."""
 OBJECT_COLOR = (234, 88, 12)
 
 
@@ -40,7 +42,7 @@ def replay(clip: Clip, *, save: Path | None, overwrite: bool = False) -> None:
     recording.send_recording_name(clip.title)
     recording.send_blueprint(_blueprint(clip))
     if clip.model is not None and clip.qpos is not None:
-        _log_shapes(recording, clip.model)
+        log_shapes(recording, clip.model)
         _log_motion(recording, clip.model, clip.qpos, clip.times)
     _log_paths(recording, clip)
     _log_curves(recording, clip)
@@ -73,13 +75,7 @@ def _blueprint(clip: Clip) -> rrb.Blueprint:
 
     first = [path for path in FIRST_PLOTS if path in clip.curves]
     others = [path for path in clip.curves if path not in first]
-    scene = rrb.Spatial3DView(
-        name="scene",
-        origin="world",
-        background=(245, 245, 245),
-        line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=(1.05, -0.85, 1.45), look_target=(-0.15, 0.05, 0.9)),
-    )
+    scene = scene_view(EYE)
     if clip.pictures:
         pictures = [rrb.Spatial2DView(name=path.removeprefix("cameras/"), origin=path) for path in clip.pictures]
         scene = rrb.Vertical(scene, rrb.Horizontal(*pictures), row_shares=[3, 2])
@@ -91,7 +87,19 @@ def _blueprint(clip: Clip) -> rrb.Blueprint:
     )
 
 
-def _log_shapes(recording: rr.RecordingStream, model: mujoco.MjModel) -> None:
+def scene_view(eye: tuple[float, float, float]) -> rrb.Spatial3DView:
+    """The table with the robot, seen from the point `eye` [m]."""
+    return rrb.Spatial3DView(
+        name="scene",
+        origin="world",
+        background=(245, 245, 245),
+        line_grid=False,
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=(-0.15, 0.05, 0.9)),
+    )
+
+
+def log_shapes(recording: rr.RecordingStream, model: mujoco.MjModel) -> None:
+    """Log what is meant to be seen of a model, each shape below its body and without time."""
     for index in range(model.ngeom):
         geom = model.geom(index)
         color = _color(model, index)
@@ -100,7 +108,7 @@ def _log_shapes(recording: rr.RecordingStream, model: mujoco.MjModel) -> None:
         shape = _shape(model, index, color)
         if shape is None:
             continue
-        path = f"world/{_body_name(model, int(geom.bodyid[0]))}/{geom.name or index}"
+        path = f"world/{body_name(model, int(geom.bodyid[0]))}/{geom.name or index}"
         pose = rr.Transform3D(translation=geom.pos, quaternion=rr.Quaternion(xyzw=xyzw_from_wxyz(geom.quat)))
         recording.log(path, pose, shape, static=True)
 
@@ -158,7 +166,8 @@ def _color(model: mujoco.MjModel, index: int) -> np.ndarray:
     return (color * 255).astype(np.uint8)
 
 
-def _body_name(model: mujoco.MjModel, body: int) -> str:
+def body_name(model: mujoco.MjModel, body: int) -> str:
+    """Name of a body's entity below `world`."""
     return model.body(body).name or str(body)
 
 
@@ -174,7 +183,7 @@ def _log_motion(recording: rr.RecordingStream, model: mujoco.MjModel, qpos: np.n
         moves = np.ptp(position[:, body], axis=0).any() or np.ptp(orientation[:, body], axis=0).any()
         rows = slice(None) if moves else slice(1)
         recording.send_columns(
-            f"world/{_body_name(model, body)}",
+            f"world/{body_name(model, body)}",
             indexes=_clock(times[rows]),
             columns=rr.Transform3D.columns(
                 translation=position[rows, body], quaternion=xyzw_from_wxyz(orientation[rows, body])

@@ -35,6 +35,21 @@ def make_environment(task: Task, robot: RobotConfig, control_hz: int, **options:
     A task for two arms gets two robots, or one that has two arms.
     """
     robosuite = import_robosuite()
+    config = controller_configs(robot)
+    quiet = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False}
+    return robosuite.make(
+        task.name,
+        robots=robots_of(task, robot),
+        controller_configs=config,
+        control_freq=control_hz,
+        ignore_done=True,
+        **(quiet | options),
+    )
+
+
+def controller_configs(robot: RobotConfig) -> Any:
+    """robosuite's configuration of a robot's controllers: its arms' is the robot config's."""
+    import_robosuite()
     from robosuite.controllers import load_composite_controller_config, load_part_controller_config
     from robosuite.models.robots.robot_model import REGISTERED_ROBOTS
 
@@ -44,15 +59,15 @@ def make_environment(task: Task, robot: RobotConfig, control_hz: int, **options:
     for arm, part in parts.items():
         part |= {key: config["body_parts"][arm][key] for key in ("gripper", "input_type", "input_ref_frame")}
     config["body_parts"] = parts
-    quiet = {"has_renderer": False, "has_offscreen_renderer": False, "use_camera_obs": False}
-    return robosuite.make(
-        task.name,
-        robots=[robot.robosuite_name] * (task.arms // len(arms) or 1),
-        controller_configs=config,
-        control_freq=control_hz,
-        ignore_done=True,
-        **(quiet | options),
-    )
+    return config
+
+
+def robots_of(task: Task, robot: RobotConfig) -> list[str]:
+    """robosuite's names of the robots of a task: two for two arms, unless one has both."""
+    import_robosuite()
+    from robosuite.models.robots.robot_model import REGISTERED_ROBOTS
+
+    return [robot.robosuite_name] * (task.arms // len(REGISTERED_ROBOTS[robot.robosuite_name].arms) or 1)
 
 
 def _remember_places(environment: Any) -> None:

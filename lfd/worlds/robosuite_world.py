@@ -25,6 +25,7 @@ from lfd.core.protocols import Observation, Progress, StepResult, WorldSpec, Wor
 from lfd.worlds.cameras import Cameras
 from lfd.worlds.drawn_sizes import draw_sizes
 from lfd.worlds.environments import PLACED, make_environment
+from lfd.worlds.model_text import xml_text
 from lfd.worlds.observing import Sight
 from lfd.worlds.robots import CONTROLLERS, RobotConfig, load_robot
 from lfd.worlds.same_numbers import compare
@@ -175,6 +176,30 @@ class RobosuiteWorld:
         self._stepper.load()
         return self._observe()
 
+    def show(self, state: Float[np.ndarray, "_"]) -> StepResult:
+        """Go to a time, qpos and qvel, one after the other as in robosuite's files, and judge them.
+
+        The rest stays as it is: controls, warm start, memory. Raises `SimulationError` for a state of another model.
+        """
+        nq, nv = self._model.nq, self._model.nv
+        if state.shape != (1 + nq + nv,):
+            raise SimulationError(f"the state has {len(state)} numbers, the model's has 1 + {nq} + {nv}")
+        self._data.time, self._data.qpos[:], self._data.qvel[:] = state[0], state[1 : 1 + nq], state[1 + nq :]
+        mujoco.mj_forward(self._model, self._data)
+        self._warnings[:] = 0
+        reward = self._env.reward(np.zeros_like(self.spec.action_low))
+        return StepResult(self._observe(), float(reward), bool(self._env._check_success()))
+
+    def settle(self) -> None:
+        """Let the arms' controllers take the present state for the one that a reset ended in.
+
+        It becomes their null-space posture, and the one whose Jacobian and pose the first control step still has.
+        """
+        for owner, arm in arms_of(self._env):
+            part = owner.composite_controller.part_controllers[arm]
+            part.update_initial_joints(self._data.qpos[part.qpos_index])
+        self._stepper.load()
+
     def _put(self, sim_state: np.ndarray) -> None:
         """Set MuJoCo's state and compute what follows from it."""
         sim = np.array(sim_state)  # MuJoCo wants an array that can be written
@@ -237,7 +262,7 @@ class RobosuiteWorld:
         if self._model_xml is None:
             self._write_places()
             assets = str(self._env.model.mujoco_arena.folder).partition("robosuite/models/assets")[0]
-            self._model_xml = self._env.model.get_xml().replace(f'"{assets}robosuite/', '"robosuite/')
+            self._model_xml = xml_text(self._env.model.root).replace(f'"{assets}robosuite/', '"robosuite/')
         return self._model_xml
 
     def _write_places(self) -> None:

@@ -1,12 +1,14 @@
-"""Robot configs: which robosuite robot, and how its arm is controlled."""
+"""Robot configs: which robosuite robot, how its arm is controlled, and how a person's device moves it."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from lfd.core.errors import UnknownName
-from lfd.core.recipe import build, load_toml
+from lfd.core.errors import RecipeError, UnknownName
+from lfd.core.recipe import Table, build, load_toml
 
 FOLDER = "robot_configs"
+TABLES = ("robot", "teleop")
+FRAMES = ("base", "view", "gripper")
 CONTROLLERS = {
     "OSC_POSE": ("x", "y", "z", "rx", "ry", "rz"),
     "OSC_POSITION": ("x", "y", "z"),
@@ -35,6 +37,31 @@ class RobotConfig:
             raise UnknownName(f"controller in {where}:", self.controller, CONTROLLERS)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TeleopConfig:
+    """The `[teleop]` table of a file in `robot_configs/`: how a person's device moves the robot."""
+
+    frame: str = "view"
+    """What the device's directions mean: base (behind the robot), view (facing it) or gripper (turning with it)."""
+    position_gain: float = 0.5
+    """Translation at full deflection, as a fraction of the controller's full action."""
+    rotation_gain: float = 0.2
+    """Rotation at full deflection, as a fraction of the controller's full action."""
+    dead_band: float = 0.05
+    """Deflection that counts as none, as a fraction of the full one; beyond it motion begins at 0."""
+
+    def check(self, where: str) -> None:
+        if self.frame not in FRAMES:
+            raise UnknownName(f"frame in {where}:", self.frame, FRAMES)
+        for key in ("position_gain", "rotation_gain"):
+            if not 0 < getattr(self, key) <= 1:
+                raise RecipeError(
+                    f"{where} {key} = {getattr(self, key)}: must be above 0 and at most 1, the full action"
+                )
+        if not 0 <= self.dead_band < 1:
+            raise RecipeError(f"{where} dead_band = {self.dead_band}: must be at least 0 and below 1")
+
+
 def config_folder() -> Path:
     """The folder `robot_configs/` of the current directory, else the one that came with lfd."""
     package = Path(__file__).parents[1]
@@ -52,7 +79,22 @@ def load_robot(name: str) -> RobotConfig:
 
     Raises `UnknownName` with the names of all configs.
     """
-    path = config_folder() / f"{name}.toml"
-    if not path.is_file():
+    return build(RobotConfig, _table(name, "robot"), f"{_path(name)} [robot]")
+
+
+def load_teleop(name: str) -> TeleopConfig:
+    """How a device moves the robot called `name`; what its config leaves open has the defaults.
+
+    Raises `UnknownName` with the names of all configs.
+    """
+    return build(TeleopConfig, _table(name, "teleop"), f"{_path(name)} [teleop]")
+
+
+def _path(name: str) -> Path:
+    return config_folder() / f"{name}.toml"
+
+
+def _table(name: str, table: str) -> Table:
+    if not _path(name).is_file():
         raise UnknownName("robot", name, robot_names(), f"Robots are files in {config_folder()}.")
-    return build(RobotConfig, load_toml(path, ["robot"]).get("robot", {}), f"{path} [robot]")
+    return load_toml(_path(name), TABLES).get(table, {})

@@ -130,8 +130,8 @@ def rollouts(
 
     A world that is free asks `next_start` for an episode; none means none at the moment. An episode begins at its
     start state, and ends when the task has been solved for `hold_steps` steps in a row (its success), at a person's
-    verdict, when the physics becomes unstable, or after `horizon` steps. Observers are called from the thread that steps their
-    world. The policy is asked once for all worlds.
+    verdict, when the physics becomes unstable, or after `horizon` steps. Observers are called from the thread that
+    steps their world. The policy is asked once for all worlds.
     """
     running: dict[int, _Episode] = {}
     with ThreadPoolExecutor(len(worlds)) as pool:

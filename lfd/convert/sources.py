@@ -1,0 +1,215 @@
+"""What a dataset is made from: recordings of lfd, MCAP files of other programs, and HDF5 demonstrations.
+
+A source is cut into units that can be read by themselves, wherever: a file, the files of one bag, a demonstration.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from lfd.convert.features import ConvertRecipe, frames_of_episode
+from lfd.convert.foreign_mcap import bags_in, frames_of_content, joined
+from lfd.convert.frames import EpisodeFrames
+from lfd.convert.mapping import MapRecipe, map_recipe
+from lfd.convert.video import VideoRecipe
+from lfd.core.artifact import sha256
+from lfd.core.episode import Episode
+from lfd.core.errors import InputError, RecipeError, RecordingError
+from lfd.core.recipe import Table, build, load_toml
+from lfd.record.episode_file import BEGIN, episode_of, recipe_in
+
+TABLES = ("record", "convert", "resample", "map", "video")
+HDF5 = (".hdf5", ".h5")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceRecipe:
+    """What a recipe says of turning sources into episodes; each kind of source needs its own tables."""
+
+    where: str
+    """The recipe's name in messages."""
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    trust_rows: bool = False
+    """Whether rows count where an HDF5 file's own numbers of them differ."""
+
+    @classmethod
+    def load(cls, path: Path | None, *, trust_rows: bool = False) -> "SourceRecipe":
+        """The recipe in a file; without one, each recording brings its own."""
+        tables = {} if path is None else load_toml(path, TABLES)
+        return cls(where=str(path or "the recipe"), tables=tables, trust_rows=trust_rows)
+
+    @classmethod
+    def kept(cls, manifest: Mapping[str, Any], where: str) -> "SourceRecipe":
+        """The recipe that a dataset's manifest keeps."""
+        recipe = manifest.get("recipe") or {}
+        tables = {name: recipe[name] for name in TABLES if name in recipe}
+        return cls(where=where, tables=tables, trust_rows=bool(manifest.get("trust_rows")))
+
+    def completed(self, units: Sequence["Unit"]) -> "SourceRecipe":
+        """With the tables that the first recording of lfd keeps, where the recipe has none of its own."""
+        if "convert" in self.tables or self.is_mapping:
+            return self
+        for unit in units:
+            kept = {} if unit.demo else recipe_in(unit.paths[0])
+            if "convert" in kept:
+                return replace(self, tables={**{name: kept[name] for name in TABLES if name in kept}, **self.tables})
+        return self
+
+    def check(self) -> None:
+        """Raise `RecipeError` for a table that cannot be read."""
+        if "convert" in self.tables:
+            self.convert()
+        if self.is_mapping:
+            self.mapping()
+        self.video()
+
+    @property
+    def is_mapping(self) -> bool:
+        """Whether it maps the topics of another program."""
+        return "map" in self.tables or "resample" in self.tables
+
+    def mapping(self) -> MapRecipe:
+        return map_recipe(self.tables, self.where)
+
+    def convert(self) -> ConvertRecipe:
+        if "convert" not in self.tables:
+            raise RecipeError(
+                f"{self.where} has no [convert] table, and no recording keeps one; name a recipe with --recipe"
+            )
+        return build(ConvertRecipe, self.tables["convert"], f"{self.where} [convert]")
+
+    def video(self) -> VideoRecipe:
+        return build(VideoRecipe, self.tables.get("video", {}), f"{self.where} [video]")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A part of the sources that is read by itself."""
+
+    paths: tuple[Path, ...]
+    """The file, or the files of one bag."""
+    demo: str = ""
+    """Name of the demonstration in an HDF5 file."""
+
+    def __str__(self) -> str:
+        name = str(self.paths[0] if len(self.paths) == 1 else self.paths[0].parent)
+        return f"{name} {self.demo}".rstrip()
+
+    @property
+    def key(self) -> str:
+        """What it is called wherever the command runs."""
+        return str(replace(self, paths=tuple(path.resolve() for path in self.paths)))
+
+    @property
+    def bytes(self) -> int:
+        """Size of its files."""
+        return sum(path.stat().st_size for path in self.paths)
+
+    def packed(self) -> "PackedUnit":
+        return PackedUnit(self, tuple(path.read_bytes() for path in self.paths))
+
+
+@dataclass(frozen=True)
+class PackedUnit:
+    """A unit with the content of its files, to be sent to another machine."""
+
+    unit: Unit
+    contents: tuple[bytes, ...]
+
+    @contextmanager
+    def unpacked(self) -> Iterator[Unit]:
+        """The unit with its files in a temporary folder; errors name the files that they came from."""
+        with TemporaryDirectory() as folder:
+            paths = tuple(Path(folder) / path.name for path in self.unit.paths)
+            for path, content in zip(paths, self.contents, strict=True):
+                path.write_bytes(content)
+            try:
+                yield replace(self.unit, paths=paths)
+            except InputError as error:
+                there = str(self.unit.paths[0].parent)
+                raise type(error)(str(error).replace(folder, there)) from error
+
+
+def units_of(sources: Sequence[Path], recipe: SourceRecipe) -> list[Unit]:
+    """The units of files and folders, folders in the order of names; a file that is given twice counts once.
+
+    Raises `RecordingError` when a source does not exist or holds nothing that can be converted.
+    """
+    found: dict[tuple[Any, ...], Unit] = {}
+    for source in sources:
+        for unit in _units_in(source, recipe):
+            found[*(path.resolve() for path in unit.paths), unit.demo] = unit
+    return list(found.values())
+
+
+def _units_in(source: Path, recipe: SourceRecipe) -> Iterator[Unit]:
+    files = sorted(path for path in source.rglob("*") if path.suffix in HDF5) if source.is_dir() else []
+    if source.suffix in HDF5:
+        files = [source]
+    for file in files:
+        from lfd.convert.hdf5_file import read_file
+
+        yield from (Unit((file,), demo) for demo in read_file(file, trust_rows=recipe.trust_rows).demos)
+    if not files:
+        if not source.exists():
+            raise RecordingError(f"no recording {source}; `lfd record RECIPE --out {source}` makes some")
+        yield from (Unit(bag) for bag in bags_in([source]))
+
+
+def frames_of(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
+    """The episodes of a unit: none, when the recipe leaves its failure out.
+
+    Raises `InputError` for what cannot be read, or not be converted.
+    """
+    if unit.demo:
+        return _frames_of_demo(unit, recipe)
+    content = joined(unit.paths)
+    if BEGIN not in content.metadata:
+        if not recipe.is_mapping:
+            raise RecipeError(
+                f"{unit} is no recording of lfd: it has no metadata {BEGIN!r}. Name a recipe with [resample] and "
+                f"[map.NAME] tables with --recipe; `lfd info {unit.paths[0]}` lists the topics"
+            )
+        return frames_of_content(content, str(unit), recipe.mapping())
+    episode = episode_of(content, unit.paths[0])
+    convert = recipe.convert()
+    if not (convert.failures or episode.success):
+        return []
+    return [frames_of_episode(episode, convert, str(unit))]
+
+
+def _frames_of_demo(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
+    from lfd.convert.hdf5_file import read_file
+    from lfd.convert.hdf5_samples import frames_of_demo
+
+    if recipe.is_mapping:
+        file = read_file(unit.paths[0], trust_rows=recipe.trust_rows)
+        return frames_of_demo(file, unit.demo, recipe.mapping(), trust_rows=recipe.trust_rows)
+    convert, replayed = recipe.convert(), _replayed(unit, recipe)
+    if not (convert.failures or replayed.episode.success):
+        return []
+    return [frames_of_episode(replayed.episode, convert, str(unit), notes=asdict(replayed.deviation))]
+
+
+def _replayed(unit: Unit, recipe: SourceRecipe) -> Any:
+    """A demonstration that went through the simulator (`lfd.convert.hdf5_replay.Replayed`)."""
+    from lfd.convert.hdf5_file import read_demo, read_file
+    from lfd.convert.hdf5_replay import replay_demo
+
+    file = read_file(unit.paths[0], trust_rows=recipe.trust_rows)
+    return replay_demo(file, read_demo(file, unit.demo, obs=(), trust_rows=recipe.trust_rows))
+
+
+def episode_in(unit: Unit, recipe: SourceRecipe) -> Episode:
+    """The episode of a recording of lfd, or of a demonstration, which the simulator fills."""
+    if unit.demo:
+        return _replayed(unit, recipe).episode
+    return episode_of(joined(unit.paths), unit.paths[0])
+
+
+def hashes(units: Sequence[Unit]) -> dict[str, str]:
+    """Path of every file to its hash."""
+    return {str(path): sha256(path) for path in dict.fromkeys(path for unit in units for path in unit.paths)}

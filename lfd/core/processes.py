@@ -1,0 +1,81 @@
+"""A map over processes of this machine; `lfd.cluster` has the same over machines."""
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any
+
+from lfd.core.errors import LfdError
+
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class ProcessMap:
+    """Runs a function over units in processes of their own, at most `cpus` at a time; with one, in this process.
+
+    Results come in the order of the units, and only some are computed ahead, so that what waits in memory is bounded.
+    """
+
+    def __init__(self, cpus: int):
+        self.cpus = cpus
+
+    def __call__[Shared, Unit, Result](
+        self, function: Callable[[Shared, Unit], Result], shared: Shared, units: Sequence[Unit]
+    ) -> Iterator[tuple[int, Result]]:
+        """Results of `function(shared, unit)`, each with the index of its unit.
+
+        `function` stands at the top of a module. What it raises is raised here; `LfdError` when a process dies.
+        """
+        if self.cpus <= 1 or len(units) <= 1:
+            for index, unit in enumerate(units):
+                yield index, function(shared, unit)
+            return
+        waiting, running = deque(enumerate(units)), deque[tuple[int, Future[Result]]]()
+        with ProcessPoolExecutor(self.cpus, get_context("spawn"), _begin, (function, shared)) as pool:
+            try:
+                while waiting or running:
+                    while waiting and len(running) < 2 * self.cpus:
+                        index, unit = waiting.popleft()
+                        running.append((index, pool.submit(_call, unit)))
+                    index, future = running.popleft()
+                    yield index, future.result()
+            except BrokenProcessPool as error:
+                raise LfdError("a worker process died, for example for lack of memory; try it with --jobs 1") from error
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+
+_work: tuple[Callable[[Any, Any], Any], Any] | None = None
+
+
+def _begin(function: Callable[[Any, Any], Any], shared: Any) -> None:
+    """What a process starts with: it keeps what all units share, and computes in one thread."""
+    global _work
+    for name in THREADS:
+        os.environ[name] = "1"
+    _work = function, shared
+
+
+def _call(unit: Any) -> Any:
+    assert _work is not None
+    function, shared = _work
+    return function(shared, unit)
+
+
+def in_order[Result](results: Iterator[tuple[int, Result]]) -> Iterator[Result]:
+    """Results in the order of their units, whatever order they come in."""
+    early: dict[int, Result] = {}
+    wanted = 0
+    for index, result in results:
+        early[index] = result
+        while wanted in early:
+            yield early.pop(wanted)
+            wanted += 1
