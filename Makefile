@@ -23,6 +23,8 @@ results: $(READY)
 	$(BIN)/lfd demo --out outputs/demo --overwrite --results docs/results.md
 	$(BIN)/lfd bench sim --full --results docs/results.md
 	$(BIN)/lfd bench cameras --results docs/results.md
+	$(BIN)/lfd bench record --results docs/results.md
+	$(BIN)/lfd bench convert --results docs/results.md
 
 pictures: $(READY)
 	$(BIN)/python docs/make_pictures.py

@@ -18,6 +18,8 @@ def about(path: Path) -> dict[str, Any]:
     """
     if path.suffix == SUFFIX:
         return _about_recording(path)
+    if path.suffix in (".hdf5", ".h5"):
+        return _about_hdf5(path)
     if path.suffix == ".toml":
         return _about_recipe(path)
     if not path.is_dir():
@@ -37,6 +39,16 @@ def about(path: Path) -> dict[str, Any]:
         facts |= {"frames": len(frames), "episodes": int(frames.episode_index.max()) + 1, "fps": frames.fps}
         facts |= {name: ", ".join(names) for name, names in frames.names.items()}
     return facts
+
+
+def _about_hdf5(path: Path) -> dict[str, Any]:
+    from lfd.convert.hdf5_file import read_file
+
+    file = read_file(path, trust_rows=True)
+    facts = {"kind": f"HDF5 demonstrations of {file.layout}", "bytes": path.stat().st_size}
+    for key in ("env_name", "robots", "control_hz", "version", "made", "action_size"):
+        facts[key] = getattr(file, key)
+    return facts | {name: f"{rows} rows" for name, rows in file.lengths.items()}
 
 
 def _about_recipe(path: Path) -> dict[str, Any]:

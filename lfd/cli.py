@@ -81,6 +81,9 @@ def _only_json_on_stdout(wanted: bool) -> Iterator[Any]:
 def _show(title: str, result: Result) -> None:
     from lfd.terminal import print_table
 
+    if list(result) == ["lines"]:
+        print(*result["lines"], sep="\n")
+        return
     rows = {}
     for key, value in result.items():
         if isinstance(value, dict) and "meaning" in value:
@@ -315,10 +318,11 @@ def _parser() -> argparse.ArgumentParser:
     made = command(
         "bench",
         commands.run_bench,
-        "measure speed side by side: sim (robosuite's step, ours, the physics alone) or cameras (robosuite's, ours)",
+        "measure speed side by side: sim (robosuite's step, ours, the physics alone), cameras (robosuite's, ours), "
+        "record (with and without, writers, real time) or convert (LeRobot's calls, ours)",
         "lfd bench sim --quick",
     )
-    made.add_argument("suite", choices=["sim", "cameras"], help="what to measure")
+    made.add_argument("suite", choices=["sim", "cameras", "record", "convert"], help="what to measure")
     made.add_argument("--quick", action="store_true", help="a tenth of the steps")
     made.add_argument(
         "--full", action="store_true",

@@ -159,7 +159,7 @@ def run_trace(given: Namespace) -> Result:
     from lfd.trace import as_json, lines_of, trace
 
     origin = trace(given.path)
-    return as_json(origin) if given.json else {"chain": "\n".join(lines_of(origin))}
+    return as_json(origin) if given.json else {"lines": lines_of(origin)}
 
 
 def run_recover(given: Namespace) -> Result:
@@ -300,7 +300,8 @@ def run_bench(given: Namespace) -> Result:
     """Speed, side by side."""
     from lfd.loops.results import write_section
 
-    measured, sections = _bench_sim(given) if given.suite == "sim" else _bench_cameras(given)
+    suites = {"sim": _bench_sim, "cameras": _bench_cameras, "record": _bench_record, "convert": _bench_convert}
+    measured, sections = suites[given.suite](given)
     if given.results is not None:
         command = f"lfd bench {given.suite}" + " --quick" * given.quick + " --full" * given.full
         for title, rows in sections.items():
@@ -327,6 +328,53 @@ def _bench_cameras(given: Namespace) -> tuple[Result, Result]:
     rows = measured["ratios"] | {"mean difference [1/255]": measured["mean_difference"]}
     rows |= {f"frames/s, {name}": rate for name, rate in measured["frames_per_second"].items()}
     return measured, {f"Cameras: {given.task} with {given.robot}": rows}
+
+
+def _bench_record(given: Namespace) -> tuple[Result, Result]:
+    from lfd.bench.record import bench_record
+    from lfd.terminal import progress_bar
+
+    measured = asdict(
+        bench_record(
+            task=given.task,
+            robot=given.robot,
+            control_hz=20,
+            episodes=5 if given.quick else 30,
+            seconds=2.0 if given.quick else 20.0,
+            seed=given.seed,
+            progress=progress_bar,
+        )
+    )
+    rows = {
+        f"simulation with recording, episodes of {length}": f"{x}x the time" for length, x in measured["cost"].items()
+    }
+    rows |= measured["ratios"]
+    for name, speed in measured["writers"].items():
+        rows[f"writer: {name}"] = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in speed.items())
+    keep_up = ", ".join(f"{name} {value:g}" for name, value in measured["real_time"].items())
+    rows["1000 Hz joint states and two 256x256 cameras at 30 Hz, in real time"] = keep_up
+    return measured, {f"Recording: {given.task} with {given.robot}": rows}
+
+
+def _bench_convert(given: Namespace) -> tuple[Result, Result]:
+    from lfd.bench.convert import bench_convert
+    from lfd.terminal import progress_bar
+
+    episodes = 5 if given.quick else 50
+    measured = asdict(
+        bench_convert(
+            task=given.task,
+            robot=given.robot,
+            episodes=episodes,
+            many=10 if given.quick else 1000,
+            seed=given.seed,
+            progress=progress_bar,
+        )
+    )
+    rows = {"episodes": episodes, "frames": measured["frames"]} | measured["ratios"]
+    rows |= {f"frames/s, {name}": rate for name, rate in measured["frames_per_second"].items()}
+    rows |= {f"largest memory at {n} episodes [MB]": size for n, size in measured["memory_mb"].items()}
+    return measured, {f"Conversion: {given.task} with {given.robot}": rows}
 
 
 def _bench_sim(given: Namespace) -> tuple[Result, Result]:

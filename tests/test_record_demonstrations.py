@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 from ctypes.util import find_library
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lfd.core.errors import LfdError, UnknownName
+from lfd.core.errors import LfdError, OutputError, UnknownName
 from lfd.core.recipe import build, load_toml
 from lfd.record.demonstrations import RecordRecipe, record
 from lfd.record.episode_file import read_episode, recordings_in
@@ -125,3 +127,45 @@ def test_a_task_without_an_expert_loses_nothing(short, tmp_path) -> None:
     with pytest.raises(UnknownName, match="unknown task of a scripted expert 'Stack'; known: Lift"):
         record(replace(short, task="Stack"), out, tables={}, overwrite=True)
     assert sorted(out.iterdir()) == before
+
+
+def test_rerun_shows_every_topic_as_what_it_is(filmed, tmp_path) -> None:
+    from rerun.experimental import RrdReader
+
+    recording, saved = filmed / "recordings" / "episode_000000.mcap", tmp_path / "episode.rrd"
+    command = [Path(sys.executable).with_name("rerun"), "mcap", "convert", recording, "-o", saved]
+    subprocess.run(command, check=True, capture_output=True)
+    shown: dict[str, set[str]] = {}
+    for chunk in RrdReader(str(saved)).stream():
+        columns = [field.metadata or {} for field in chunk.to_record_batch().schema]
+        components = {column[b"rerun:component"].decode() for column in columns if b"rerun:component" in column}
+        shown.setdefault(str(chunk.entity_path), set()).update(components)
+    expected = {
+        "/joint_states/position": "Scalars:scalars",
+        "/joint_states/velocity": "Scalars:scalars",
+        "/action": "Scalars:scalars",
+        "/step": "Scalars:scalars",
+        "/ee_pose": "InstancePoses3D:quaternions",
+        "/objects/cube/pose": "InstancePoses3D:translations",
+        "/tf": "Transform3D:translation",
+        "/cameras/agentview": "EncodedImage:blob",
+        "/events": "TextLog:text",
+        "/task": "TextDocument:text",
+    }
+    for path, component in expected.items():
+        assert component in shown[path], f"{path} shows {shown[path]}"
+
+
+def test_a_recording_that_is_gone_on_with_ends_as_if_never_interrupted(short, tmp_path) -> None:
+    record(short, tmp_path / "whole", tables={})
+    record(replace(short, episodes=1), tmp_path / "resumed", tables={})
+    done = record(short, tmp_path / "resumed", tables={}, resume=True)
+    assert done.episodes == 3
+    whole, resumed = recordings_in([tmp_path / "whole"]), recordings_in([tmp_path / "resumed"])
+    assert [path.name for path in whole] == [path.name for path in resumed]
+    for one, other in zip(whole, resumed, strict=True):
+        np.testing.assert_array_equal(read_episode(one).sim_states, read_episode(other).sim_states)
+    with pytest.raises(OutputError, match=r"was recorded with action_noise = .*; go on with the same recipe"):
+        record(replace(short, action_noise=0.01), tmp_path / "resumed", tables={}, resume=True)
+    with pytest.raises(OutputError, match="holds no recordings to go on with; leave --resume out"):
+        record(short, tmp_path / "none", tables={}, resume=True)

@@ -166,6 +166,12 @@ def test_an_error_leaves_finished_episodes_and_nothing_else(recipe, tmp_path) ->
     assert left == ["episode_000000.mcap", "manifest.json"]
 
 
+def _at_a_terminal() -> None:
+    """Make the terminal on standard input the process' own, and Ctrl-C heard: shells ignore it in background jobs."""
+    os.close(os.open(os.ttyname(0), os.O_RDWR))
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Person:
     """Sits at the terminal of an `lfd record --device keyboard` in a process of its own."""
 
@@ -182,7 +188,7 @@ class Person:
             stderr=there,
             text=True,
             start_new_session=True,
-            preexec_fn=lambda: os.close(os.open(os.ttyname(0), os.O_RDWR)),  # it becomes the process' terminal
+            preexec_fn=_at_a_terminal,
             env={name: value for name, value in os.environ.items() if name not in ("DISPLAY", "WAYLAND_DISPLAY")},
         )
 
@@ -292,5 +298,5 @@ def test_a_person_moves_one_robot(lfd_fails, tmp_path) -> None:
         error = lfd_fails(*record, "--device", "keyboard", *options)
         assert f"a person moves one robot at a time: leave out {options[0]}" in error
     assert "unknown device 'keybord'; known: gamepad, keyboard, spacemouse" in lfd_fails(*record, "--device", "keybord")
-    assert "--resume is for people" in lfd_fails(*record, "--resume")
+    assert "--no-view is for people" in lfd_fails(*record, "--no-view")
     assert not (tmp_path / "out").exists()

@@ -179,7 +179,10 @@ def test_what_is_sent_arrives(lift_world, no_screen, tmp_path) -> None:
         view.show(lift_world)
         command = [Path(sys.executable).parent / "rerun", "--connect", source, "--save", file]
         reader = subprocess.Popen(
-            [*command, "--bind", "127.0.0.1", "--port", "auto"], stderr=subprocess.DEVNULL, start_new_session=True
+            [*command, "--bind", "127.0.0.1", "--port", "auto"],
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # shells ignore it in background jobs
         )
         for _ in range(60):
             lift_world.step(np.array([0.5, 0.1, -0.2, 0, 0, 0.2, 1.0]))

@@ -11,7 +11,7 @@ from lfd.convert.frames import EpisodeFrames
 from lfd.convert.lerobot_writer import INFO, OWN
 from lfd.convert.mcap_export import export_mcap
 from lfd.convert.robomimic_export import export_episodes, export_frames
-from lfd.convert.sources import SourceRecipe, Unit, episode_in, units_of
+from lfd.convert.sources import SourceRecipe, Unit, episode_in, hashes, units_of
 from lfd.core.artifact import new_folder, write_manifest
 from lfd.core.errors import InputError
 from lfd.core.protocols import Progress, silent
@@ -111,5 +111,5 @@ def _export_recordings(
         for index, unit in enumerate(units):
             write_episode(part / f"episode_{index:06d}{SUFFIX}", episode_in(unit, recipe))
             bar.advance()
-        write_manifest(part, kind="recordings", recipe={}, parents={}, seed=0)
+        write_manifest(part, kind="recordings", recipe={}, parents=hashes(units), seed=0)
     return Exported(str(out), len(units))

@@ -3,16 +3,20 @@
 All that costs time happens here, in whichever process reads the source; what is left for the writer is to append.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
-from lfd.convert.frames import EpisodeFrames
+from lfd.convert.frames import EpisodeFrames, Pictures
 from lfd.convert.statistics import Stats, column_stats, picture_stats, sampled_rows
 from lfd.convert.video import PNG, VideoRecipe, encode_video, video_info
+from lfd.core.errors import DatasetError
 from lfd.record.png import encode_png
+
+Picture = UInt8[np.ndarray, "H W 3"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,19 +46,24 @@ class PreparedEpisode:
 
 
 def prepare(frames: EpisodeFrames, video: VideoRecipe) -> PreparedEpisode:
-    """Encode an episode's pictures and compute its statistics."""
+    """Encode an episode's pictures and compute its statistics.
+
+    Raises `DatasetError` for pictures that change their size, or that the codec does not take.
+    """
     features = {name: _vector(rows, frames.names[name]) for name, rows in frames.columns.items()}
     stats = column_stats(frames.columns)
     pngs, videos = {}, {}
     for name, pictures in frames.pictures.items():
-        sampled = [pictures[row] for row in sampled_rows(len(pictures))]
+        where, sampled = f"{frames.source}: {name}", list[Picture]()
+        passing = _passing(pictures, sampled, where, frames.fps)
+        if video.codec == PNG:
+            pngs[name] = [encode_png(picture) for picture in passing]
+        else:
+            videos[name] = encode_video(passing, frames.fps, video, where)
         stats[name] = picture_stats(sampled)
         height, width, _ = sampled[0].shape
         features[name] = {"dtype": "image", "shape": (height, width, 3), "names": ["height", "width", "channels"]}
-        if video.codec == PNG:
-            pngs[name] = [encode_png(picture) for picture in pictures]
-        else:
-            videos[name] = encode_video(pictures, frames.fps, video)
+        if name in videos:
             features[name] |= {"dtype": "video", "info": video_info(height, width, frames.fps, video)}
     return PreparedEpisode(
         source=frames.source,
@@ -71,6 +80,22 @@ def prepare(frames: EpisodeFrames, video: VideoRecipe) -> PreparedEpisode:
         recipe=frames.recipe,
         model_xml=frames.model_xml,
     )
+
+
+def _passing(pictures: Pictures, sampled: list[Picture], where: str, fps: int) -> Iterator[Picture]:
+    """The pictures one after another; those for the statistics are kept on the way.
+
+    Raises `DatasetError` where their size changes.
+    """
+    wanted, size = set(sampled_rows(len(pictures))), ()
+    for row, picture in enumerate(pictures):
+        size = size or picture.shape
+        if picture.shape != size:
+            was, now = (f"{shape[1]} x {shape[0]}" for shape in (size, picture.shape))
+            raise DatasetError(f"{where} changes its size from {was} to {now} in row {row} ({row / fps:.3f} s)")
+        if row in wanted:
+            sampled.append(picture)
+        yield picture
 
 
 def _vector(rows: np.ndarray, names: tuple[str, ...]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from lfd.convert.mapping import MapRecipe, map_recipe
 from lfd.convert.video import VideoRecipe
 from lfd.core.artifact import sha256
 from lfd.core.episode import Episode
-from lfd.core.errors import InputError, RecipeError, RecordingError
+from lfd.core.errors import RecipeError, RecordingError
 from lfd.core.recipe import Table, build, load_toml
 from lfd.record.episode_file import BEGIN, episode_of, recipe_in
 
@@ -34,6 +34,8 @@ class SourceRecipe:
     tables: Mapping[str, Table] = field(default_factory=dict)
     trust_rows: bool = False
     """Whether rows count where an HDF5 file's own numbers of them differ."""
+    trust_total: bool = False
+    """The same for the sum of all demonstrations alone."""
 
     @classmethod
     def load(cls, path: Path | None, *, trust_rows: bool = False) -> "SourceRecipe":
@@ -46,7 +48,24 @@ class SourceRecipe:
         """The recipe that a dataset's manifest keeps."""
         recipe = manifest.get("recipe") or {}
         tables = {name: recipe[name] for name in TABLES if name in recipe}
-        return cls(where=where, tables=tables, trust_rows=bool(manifest.get("trust_rows")))
+        return cls(where=where, tables=tables, trust_rows=bool(manifest.get("trust_rows")), trust_total=True)
+
+    def going_on(self, kept: "SourceRecipe") -> "SourceRecipe":
+        """With the tables by which a dataset was made, for the episodes that are added to it.
+
+        Raises `RecipeError` for a table that says something else than the dataset's.
+        """
+        for name, read in (
+            ("convert", SourceRecipe.convert),
+            ("map", SourceRecipe.mapping),
+            ("video", SourceRecipe.video),
+        ):
+            if name in self.tables and name in kept.tables and read(self) != read(kept):
+                raise RecipeError(
+                    f"{self.where} [{name}] is not the one by which {kept.where} says that the dataset was made; leave "
+                    "out --recipe to go on by that one, or make another dataset"
+                )
+        return replace(self, tables={**kept.tables, **self.tables}, trust_rows=self.trust_rows or kept.trust_rows)
 
     def completed(self, units: Sequence["Unit"]) -> "SourceRecipe":
         """With the tables that the first recording of lfd keeps, where the recipe has none of its own."""
@@ -121,16 +140,16 @@ class PackedUnit:
 
     @contextmanager
     def unpacked(self) -> Iterator[Unit]:
-        """The unit with its files in a temporary folder; errors name the files that they came from."""
+        """The unit with its files in a temporary folder."""
         with TemporaryDirectory() as folder:
             paths = tuple(Path(folder) / path.name for path in self.unit.paths)
             for path, content in zip(paths, self.contents, strict=True):
                 path.write_bytes(content)
-            try:
-                yield replace(self.unit, paths=paths)
-            except InputError as error:
-                there = str(self.unit.paths[0].parent)
-                raise type(error)(str(error).replace(folder, there)) from error
+            yield replace(self.unit, paths=paths)
+
+    def named(self, text: str, here: Unit) -> str:
+        """A text about the unpacked unit `here` with the folder that its files came from."""
+        return text.replace(str(here.paths[0].parent), str(self.unit.paths[0].parent))
 
 
 def units_of(sources: Sequence[Path], recipe: SourceRecipe) -> list[Unit]:
@@ -150,13 +169,27 @@ def _units_in(source: Path, recipe: SourceRecipe) -> Iterator[Unit]:
     if source.suffix in HDF5:
         files = [source]
     for file in files:
-        from lfd.convert.hdf5_file import read_file
-
-        yield from (Unit((file,), demo) for demo in read_file(file, trust_rows=recipe.trust_rows).demos)
+        yield from _demos_in(file, recipe)
     if not files:
         if not source.exists():
             raise RecordingError(f"no recording {source}; `lfd record RECIPE --out {source}` makes some")
         yield from (Unit(bag) for bag in bags_in([source]))
+
+
+def _demos_in(file: Path, recipe: SourceRecipe) -> Iterator[Unit]:
+    """The demonstrations of an HDF5 file; one that cannot be read is a unit that will say so."""
+    try:
+        demos = _hdf5(file, recipe).demos
+    except RecordingError:
+        demos = ("",)
+    yield from (Unit((file,), demo) for demo in demos)
+
+
+def _hdf5(file: Path, recipe: SourceRecipe) -> Any:
+    """What an HDF5 file says of its demonstrations (`lfd.convert.hdf5_file.DemoFile`)."""
+    from lfd.convert.hdf5_file import read_file
+
+    return read_file(file, trust_rows=recipe.trust_rows or recipe.trust_total)
 
 
 def frames_of(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
@@ -164,7 +197,7 @@ def frames_of(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
 
     Raises `InputError` for what cannot be read, or not be converted.
     """
-    if unit.demo:
+    if unit.paths[0].suffix in HDF5:
         return _frames_of_demo(unit, recipe)
     content = joined(unit.paths)
     if BEGIN not in content.metadata:
@@ -182,11 +215,10 @@ def frames_of(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
 
 
 def _frames_of_demo(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
-    from lfd.convert.hdf5_file import read_file
     from lfd.convert.hdf5_samples import frames_of_demo
 
+    file = _hdf5(unit.paths[0], recipe)
     if recipe.is_mapping:
-        file = read_file(unit.paths[0], trust_rows=recipe.trust_rows)
         return frames_of_demo(file, unit.demo, recipe.mapping(), trust_rows=recipe.trust_rows)
     convert, replayed = recipe.convert(), _replayed(unit, recipe)
     if not (convert.failures or replayed.episode.success):
@@ -196,10 +228,10 @@ def _frames_of_demo(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
 
 def _replayed(unit: Unit, recipe: SourceRecipe) -> Any:
     """A demonstration that went through the simulator (`lfd.convert.hdf5_replay.Replayed`)."""
-    from lfd.convert.hdf5_file import read_demo, read_file
+    from lfd.convert.hdf5_file import read_demo
     from lfd.convert.hdf5_replay import replay_demo
 
-    file = read_file(unit.paths[0], trust_rows=recipe.trust_rows)
+    file = _hdf5(unit.paths[0], recipe)
     return replay_demo(file, read_demo(file, unit.demo, obs=(), trust_rows=recipe.trust_rows))
 
 

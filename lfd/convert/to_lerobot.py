@@ -1,15 +1,15 @@
 """The convert stage: recordings, ROS 2 bags and HDF5 demonstrations become one LeRobot v3 dataset, which may grow."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from lfd.convert.lerobot_writer import INFO, DatasetWriter, dataset_writer
 from lfd.convert.prepared import PreparedEpisode, prepare
-from lfd.convert.sources import SourceRecipe, Unit, frames_of, hashes, units_of
+from lfd.convert.sources import PackedUnit, SourceRecipe, Unit, frames_of, hashes, units_of
 from lfd.convert.verify import Placed, verify_placed
-from lfd.core.artifact import new_folder, read_manifest, write_manifest
+from lfd.core.artifact import heal, new_folder, read_manifest, write_manifest
 from lfd.core.errors import DatasetError, EpisodeError, InputError, OutputError, RecordingError
 from lfd.core.processes import ProcessMap, cores, in_order
 from lfd.core.protocols import Progress, UnitMap, silent
@@ -19,6 +19,8 @@ SKIPPABLE = (RecordingError, EpisodeError, DatasetError)
 """What `skip_bad` may leave out: faults of a recording, not of the recipe."""
 WORTH_PROCESSES = 32 * 2**20
 """Sources of so many bytes are read in processes of their own; fewer are read before a process has started."""
+SHARED = ("robot", "controller", "task", "control_hz")
+"""What a manifest keeps of that which all episodes share; the task may differ."""
 AHEAD = 8
 """Units for each CPU of a cluster that are sent there at once; their results wait in memory for their turn."""
 
@@ -55,26 +57,31 @@ def convert(
 ) -> Converted:
     """Convert files, or folders of them, into the dataset folder `out`, or `append` them to the one that is there.
 
-    Without a `recipe`, the `[convert]` table kept in each recording is used. Units are read by `jobs` processes, by as
-    many as there are cores where it is worth it, or on a `cluster`; the dataset does not depend on that. It is read
-    back and compared with its sources before it appears under its name: after an interruption there is the old one or
-    none.
+    Without a `recipe`, that of the dataset that grows is used, or else the `[convert]` table kept in each recording.
+    Units are read by `jobs` processes, by as many as there are cores where it is worth it, or on a `cluster`; the
+    dataset does not depend on that. It is read back and compared with its sources before it appears under its name:
+    after an interruption there is the old one or none.
 
     Raises `RecordingError` or `EpisodeError` for a source that cannot be read and `DatasetError` when episodes do not
     go together, unless `skip_bad` leaves them out; `OutputError` when `out` exists, `VerificationError` when the
     dataset differs.
     """
     recipe = recipe or SourceRecipe(where="the recipe")
+    recipe = replace(recipe, trust_total=skip_bad)
     recipe.check()
-    if append and not (out / INFO).is_file():
-        raise OutputError(f"{out} is no dataset that could grow; leave out --append to make one")
+    manifest: Mapping[str, Any] = {}
+    if append:
+        heal(out)
+        if not (out / INFO).is_file():
+            raise OutputError(f"{out} is no dataset that could grow; leave out --append to make one")
+        manifest = read_manifest(out) or {}
+        recipe = recipe.going_on(SourceRecipe.kept(manifest, f"{out} manifest.json"))
     units = units_of(sources, recipe)
     recipe = recipe.completed(units)
     run = cluster or _processes(units, jobs)
-    tally = _Tally(skip_bad)
+    _refuse_known(units, manifest)
+    tally = _Tally(skip_bad, manifest)
     with new_folder(out, overwrite=overwrite, grow=append) as part:
-        manifest = (read_manifest(out) or {}) if append else {}
-        _refuse_known(units, manifest)
         with dataset_writer(part) as writer, progress("convert", len(units)) as bar:
             before = writer.episodes, writer.frames
             for unit, episodes, error in _read(units, recipe, run):
@@ -125,25 +132,28 @@ def _prepare_unit(recipe: SourceRecipe, unit: Unit) -> tuple[list[PreparedEpisod
         return [], error
 
 
-def _prepare_sent(recipe: SourceRecipe, unit: Any) -> tuple[list[PreparedEpisode], InputError | None]:
-    """The same on another machine, to which the unit's files were sent."""
+def _prepare_sent(recipe: SourceRecipe, unit: PackedUnit) -> tuple[list[PreparedEpisode], InputError | None]:
+    """The same on another machine, to which the unit's files were sent; messages name those on the first one."""
     with unit.unpacked() as here:
-        return _prepare_unit(recipe, here)
+        episodes, error = _prepare_unit(recipe, here)
+        named = None if error is None else type(error)(unit.named(str(error), here))
+        return [replace(episode, source=unit.named(episode.source, here)) for episode in episodes], named
 
 
 class _Tally:
     """What became of the units so far."""
 
-    def __init__(self, skip_bad: bool):
+    def __init__(self, skip_bad: bool, manifest: Mapping[str, Any]):
+        """`manifest` is that of the dataset that grows."""
         self._skip_bad = skip_bad
         self.placed: list[Placed] = []
         """Units that were taken, each with the number of its first episode."""
         self.skipped: dict[str, str] = {}
         self.left_out = 0
         self.notes: dict[str, Mapping[str, Any]] = {}
-        self.about: dict[str, Any] = {}
+        self.about: dict[str, Any] = {key: manifest[key] for key in SHARED if key in manifest}
         self.recipe: dict[str, Any] = {}
-        self.units: dict[str, list[str]] = {}
+        self.units: dict[str, list[str]] = dict(manifest.get("units", {}))
 
     def take(
         self,
@@ -170,9 +180,9 @@ class _Tally:
             return
         self.placed.append((unit, writer.episodes))
         for episode in episodes:
-            if not self.about:
-                self.about, self.recipe = dict(episode.about), dict(episode.recipe)
-                self.units = {name: list(units) for name, units in episode.units.items()}
+            self.about = self.about or dict(episode.about)
+            self.recipe = self.recipe or dict(episode.recipe)
+            self.units = self.units or {name: list(units) for name, units in episode.units.items()}
             if episode.notes:
                 self.notes[f"{writer.episodes} {episode.source}"] = episode.notes
             if episode.model_xml and not (root / MODEL).is_file():
@@ -194,26 +204,34 @@ class _Tally:
 
 
 def _refuse_known(units: Sequence[Unit], manifest: Mapping[str, Any]) -> None:
-    known = {str(Path(path).resolve()) for path in manifest.get("parents", {})}
-    for unit in units:
-        for path in unit.paths:
-            if str(path.resolve()) in known:
-                raise DatasetError(f"{path} is in the dataset already; give only what is new")
+    """Refuse what is in a dataset already, by whatever name it is known there."""
+    known = {digest: path for path, digest in manifest.get("parents", {}).items()}
+    if not known:
+        return
+    for path, digest in hashes(units).items():
+        if digest in known:
+            was = "" if known[digest] == path else f" as {known[digest]}"
+            raise DatasetError(f"{path} is in the dataset already{was}; give only what is new")
+    there = {str(Path(path).resolve()) for path in known.values()}
+    for path in (path for unit in units for path in unit.paths):
+        if str(path.resolve()) in there:
+            raise DatasetError(f"{path} is in the dataset already, and has changed since; convert all sources anew")
 
 
 def _describe(root: Path, recipe: SourceRecipe, tally: _Tally, manifest: Mapping[str, Any]) -> None:
     """Write the manifest: recipe, sources by hash, units, and what was left out."""
     tables = tally.recipe | (manifest.get("recipe") or {}) | dict(recipe.tables)
-    about = {key: manifest.get(key, value) for key, value in tally.about.items()}
+    taken = {unit.key for unit, _ in tally.placed}
+    skipped = {key: why for key, why in manifest.get("skipped", {}).items() if key not in taken} | tally.skipped
     write_manifest(
         root,
         kind="dataset",
         recipe=tables,
         parents={**manifest.get("parents", {}), **hashes([unit for unit, _ in tally.placed])},
         seed=tables.get("record", {}).get("seed", 0),
-        **about,
+        **tally.about,
         trust_rows=recipe.trust_rows,
-        units=manifest.get("units", {}) | tally.units,
-        skipped={**manifest.get("skipped", {}), **tally.skipped},
+        units=tally.units,
+        skipped=skipped,
         notes={**manifest.get("notes", {}), **tally.notes},
     )

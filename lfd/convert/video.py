@@ -1,6 +1,7 @@
 """Pictures to videos: frames go from memory to the encoder, no picture file in between."""
 
 import io
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -8,10 +9,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from lfd.core.errors import RecipeError, UnknownName
+from lfd.core.errors import DatasetError, RecipeError, UnknownName
 
 PNG = "png"
 CODECS = ("libsvtav1", "h264", "hevc")
+WORST = {"libsvtav1": 63, "h264": 51, "hevc": 51, PNG: 63}
+"""Codec to the highest crf that it knows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +33,11 @@ class VideoRecipe:
     def check(self, where: str) -> None:
         if self.codec not in (*CODECS, PNG):
             raise UnknownName(f"codec in {where}:", self.codec, (*CODECS, PNG))
-        for key, low, high in (("crf", 0, 63), ("gop", 1, 1000), ("preset", 0, 13)):
+        for key, low, high in (("crf", 0, WORST[self.codec]), ("gop", 1, 1000), ("preset", 0, 13)):
             if not low <= getattr(self, key) <= high:
-                raise RecipeError(f"{where} {key} = {getattr(self, key)}: must be from {low} to {high}")
+                raise RecipeError(
+                    f"{where} {key} = {getattr(self, key)}: must be from {low} to {high} with codec {self.codec}"
+                )
 
     @property
     def options(self) -> dict[str, str]:
@@ -40,23 +45,37 @@ class VideoRecipe:
         common = {"g": str(self.gop), "crf": str(self.crf)}
         if self.codec == "libsvtav1":
             return common | {"preset": str(self.preset), "svtav1-params": "fast-decode=0:lp=1"}
-        return common | {"threads": "1"}  # episodes are encoded in parallel
+        quiet = {"x265-params": "log-level=error:pools=none"} if self.codec == "hevc" else {}
+        return common | quiet | {"threads": "1"}  # episodes are encoded in parallel
 
 
-def encode_video(pictures: Iterable[UInt8[np.ndarray, "H W 3"]], fps: int, recipe: VideoRecipe) -> bytes:
-    """RGB pictures as an MP4 file of yuv420p frames at a steady rate."""
+def encode_video(pictures: Iterable[UInt8[np.ndarray, "H W 3"]], fps: int, recipe: VideoRecipe, where: str) -> bytes:
+    """RGB pictures of one size as an MP4 file of yuv420p frames at a steady rate; messages call them `where`.
+
+    Raises `DatasetError` for a size or rate that the codec does not take.
+    """
     import av
+    from av.error import FFmpegError
 
-    file = io.BytesIO()
-    with av.open(file, "w", format="mp4") as output:
-        stream: Any = None
-        for picture in pictures:
-            if stream is None:
-                stream = output.add_stream(recipe.codec, fps, options=recipe.options)
-                stream.height, stream.width = picture.shape[:2]
-                stream.pix_fmt = "yuv420p"
-            output.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
-        output.mux(stream.encode())
+    os.environ.setdefault("SVT_LOG", "1")  # else libsvtav1 tells its settings for every video
+    file, size = io.BytesIO(), (0, 0)
+    try:
+        with av.open(file, "w", format="mp4") as output:
+            stream: Any = None
+            for picture in pictures:
+                if stream is None:
+                    size = picture.shape[:2]
+                    stream = output.add_stream(recipe.codec, fps, options=recipe.options)
+                    stream.height, stream.width = size
+                    stream.pix_fmt = "yuv420p"
+                output.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+            output.mux(stream.encode())
+    except FFmpegError as error:
+        raise DatasetError(
+            f"{where}: {recipe.codec} cannot encode pictures of {size[1]} x {size[0]} at {fps} Hz ({error}); h264 and "
+            "hevc want even sizes, libsvtav1 at most 240 Hz, no codec very small pictures: change them, or keep them "
+            'without loss with codec = "png" in [video]'
+        ) from error
     return file.getvalue()
 
 
@@ -81,8 +100,12 @@ def video_info(height: int, width: int, fps: int, recipe: VideoRecipe) -> dict[s
         "video.pix_fmt": "yuv420p",
         "video.fps": fps,
         "video.channels": 3,
+        "has_audio": False,
         "video.g": recipe.gop,
         "video.crf": recipe.crf,
-        "has_audio": False,
+        "video.preset": recipe.preset if recipe.codec == "libsvtav1" else None,
+        "video.fast_decode": 0,
+        "video.video_backend": "pyav",
+        "video.extra_options": {},
         "is_depth_map": False,
     }

@@ -125,7 +125,7 @@ def new_folder(path: Path, *, overwrite: bool, grow: bool = False) -> Iterator[P
 
     Raises `OutputError` when `path` exists and may not be replaced, or cannot be written.
     """
-    _heal(path)
+    heal(path)
     check_output(path, overwrite=overwrite or grow)
     part = _beside(path, str(os.getpid()), "part")
     try:
@@ -160,7 +160,7 @@ def _link(source: str, target: str) -> None:
         shutil.copy2(source, target)
 
 
-def _heal(path: Path) -> None:
+def heal(path: Path) -> None:
     """Undo what runs that were killed left: half-made folders, and a folder that was about to be replaced."""
     if not path.parent.is_dir():
         return
@@ -175,6 +175,9 @@ def _heal(path: Path) -> None:
 
 
 def _is_running(process: int) -> bool:
+    """Whether another process has this number: in a container, a run may have that of the killed one before it."""
+    if process == os.getpid():
+        return False
     try:
         os.kill(process, 0)
     except ProcessLookupError:

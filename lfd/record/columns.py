@@ -5,6 +5,7 @@ All messages of a topic of ours have the same names and sizes, so the numbers of
 """
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
@@ -21,7 +22,7 @@ def arrays(messages: Messages) -> tuple[tuple[str, ...], Float[np.ndarray, "N D"
     Raises `ValueError` when sizes differ.
     """
     names, first = cdr.unpack_array(messages[0])
-    rows = _read(messages, array_pack(names), len(first), lambda data: cdr.unpack_array(data)[1])
+    rows = _read(messages, array_layout(names, len(first)), lambda data: cdr.unpack_array(data)[1])
     return names, rows
 
 
@@ -42,21 +43,39 @@ def joint_states(messages: Messages) -> tuple[tuple[str, ...], Float[np.ndarray,
             raise ValueError(f"the joints of a JointState change from {first.name} to {state.name}")
         return np.concatenate([state.position, state.velocity, state.effort])
 
-    return first.name, _read(messages, joint_state_pack(first.name), 3 * joints, unpack).reshape(-1, 3, joints)
+    return first.name, _read(messages, joint_state_layout(first.name), unpack).reshape(-1, 3, joints)
 
 
 def poses(messages: Messages) -> Float[np.ndarray, "N 7"]:
     """geometry_msgs/PoseStamped: position [m] and quaternion xyzw of each message."""
-    return _read(messages, pose_pack, 7, lambda data: np.concatenate(cdr.unpack_pose(data)))
+    return _read(messages, pose_layout(), lambda data: np.concatenate(cdr.unpack_pose(data)))
 
 
-def _read(messages: Messages, pack: Pack, size: int, unpack: Callable[[bytes], np.ndarray]) -> np.ndarray:
-    rows = Layout.of(pack, size).read(messages)
+def _read(messages: Messages, layout: Layout, unpack: Callable[[bytes], np.ndarray]) -> np.ndarray:
+    rows = layout.read(messages)
     if rows is None:
-        rows = np.array([unpack(data) for data in messages])
+        rows, size = np.array([unpack(data) for data in messages]), layout.numbers.size // 8
         if rows.shape[1:] != (size,):
             raise ValueError(f"messages have {rows.shape[1:]} numbers, the first has {size}")
     return rows
+
+
+@lru_cache(maxsize=64)
+def array_layout(components: tuple[str, ...], size: int) -> Layout:
+    """Where the numbers of an array stand; there may be one name for all of them."""
+    return Layout.of(array_pack(components), size)
+
+
+@lru_cache(maxsize=64)
+def joint_state_layout(names: tuple[str, ...]) -> Layout:
+    """Where positions, velocities and efforts of a JointState stand."""
+    return Layout.of(joint_state_pack(names), 3 * len(names))
+
+
+@lru_cache(maxsize=1)
+def pose_layout() -> Layout:
+    """Where position and quaternion xyzw of a PoseStamped stand."""
+    return Layout.of(pose_pack, 7)
 
 
 def array_pack(components: Sequence[str]) -> Pack:

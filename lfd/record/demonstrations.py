@@ -165,7 +165,12 @@ def attempts_in(out: Path, recipe: RecordRecipe, same: Sequence[str]) -> list[in
                 f"{out} was recorded with {key} = {before.get(key)!r}, the recipe says {now[key]!r}; "
                 "go on with the same recipe, or choose another --out"
             )
-    names = (re.match(rf"{EPISODE}(\d+){re.escape(SUFFIX)}$", path.name) for path in out.iterdir())
+    return numbers_in(out, "$")
+
+
+def numbers_in(out: Path, ending: str) -> list[int]:
+    """Numbers of the recordings in a folder whose names end in a pattern after `.mcap`."""
+    names = (re.match(rf"{EPISODE}(\d+){re.escape(SUFFIX)}{ending}", path.name) for path in out.iterdir())
     return sorted(int(name[1]) for name in names if name)
 
 

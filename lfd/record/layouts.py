@@ -50,7 +50,7 @@ class Layout:
         """The numbers of messages, or None when one of them has other names or sizes."""
         size = len(self.template)
         joined = b"".join(messages)
-        if len(joined) != size * len(messages) or any(len(m) != size for m in messages):
+        if set(map(len, messages)) != {size}:
             return None
         rows = np.frombuffer(joined, np.uint8).reshape(len(messages), size)
         fixed = np.ones(size, dtype=bool)

@@ -8,7 +8,6 @@ library's reader; rare ones are taken apart by the library.
 import io
 import struct
 import zlib
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -30,7 +29,8 @@ DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, Ov
           IndexError, RuntimeError, MemoryError)  # fmt: skip
 """What reading a damaged file can raise; UnicodeDecodeError is a ValueError, lz4 raises RuntimeError."""
 RECORD_HEAD = struct.Struct("<BQ")
-MESSAGE_HEAD = struct.Struct("<HIQQ")
+MESSAGE = struct.Struct("<BQHIQQ")
+"""Opcode, length, channel, sequence number, log time, publish time."""
 CHUNK_HEAD = struct.Struct("<QQQII")
 """First and last log time, uncompressed size, checksum, length of the compression's name."""
 MOST_UNPACKED = 64, 64 * 2**20
@@ -178,7 +178,7 @@ class _Reading:
     def __init__(self) -> None:
         self.channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
-        self._messages: defaultdict[int, list[tuple[int, bytes]]] = defaultdict(list)
+        self._messages: dict[int, list[tuple[int, bytes]]] = {}
         self._metadata: dict[str, Mapping[str, str]] = {}
         self._attachments: dict[str, bytes] = {}
         self._expected: int | None = None
@@ -189,20 +189,16 @@ class _Reading:
         Raises what is in `DAMAGE`.
         """
         if opcode == Opcode.CHUNK:
-            chunk = _unpack_chunk(content)
-            for inner, begin, end in _records(chunk, 0):
-                if inner == Opcode.MESSAGE:
-                    self._take_message(chunk, begin, end)
-                else:
-                    self.take(inner, chunk[begin:end])
+            self._take_chunk(_unpack_chunk(content))
         elif opcode == Opcode.MESSAGE:
-            self._take_message(content, 0, len(content))
+            self._take_chunk(RECORD_HEAD.pack(Opcode.MESSAGE, len(content)) + bytes(content))
         elif opcode == Opcode.SCHEMA:
             schema = Schema.read(_stream(content))
             self._schemas[schema.id] = schema
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(_stream(content))
             self.channels[channel.id] = channel
+            self._messages.setdefault(channel.id, [])
         elif opcode == Opcode.METADATA:
             record = Metadata.read(_stream(content))
             self._metadata[record.name] = record.metadata
@@ -228,13 +224,23 @@ class _Reading:
         if footer.summary_crc and zlib.crc32(head, zlib.crc32(before[footer.summary_start :])) != footer.summary_crc:
             raise ValueError("the checksum of the summary is wrong")
 
-    def _take_message(self, data: memoryview, begin: int, end: int) -> None:
-        number, _, log_time, _ = MESSAGE_HEAD.unpack_from(data, begin)
-        if end - begin < MESSAGE_HEAD.size:
-            raise ValueError("a message is shorter than its head")
-        if number not in self.channels:
-            raise ValueError(f"a message of channel {number}, which the file does not describe")
-        self._messages[number].append((log_time, bytes(data[begin + MESSAGE_HEAD.size : end])))
+    def _take_chunk(self, data: bytes) -> None:
+        """Take the records of a chunk in; the loop that reading a file spends its time in."""
+        at, end, unpack, known = 0, len(data), MESSAGE.unpack_from, self._messages
+        while at < end:
+            if data[at] != Opcode.MESSAGE:
+                opcode, begin, then = next(_records(memoryview(data), at))
+                self.take(opcode, memoryview(data)[begin:then])
+                at = then
+                continue
+            _, length, number, _, log_time, _ = unpack(data, at)
+            then = at + RECORD_HEAD.size + length
+            if then > end or length < MESSAGE.size - RECORD_HEAD.size:
+                raise EOFError(f"a message of {length} bytes is cut off")
+            if number not in known:
+                raise ValueError(f"a message of channel {number}, which the file does not describe")
+            known[number].append((log_time, data[at + MESSAGE.size : then]))
+            at = then
 
     def content(self, *, check: bool = True) -> McapContent:
         """Everything by topic."""
@@ -249,7 +255,7 @@ class _Reading:
             first = content.topics.setdefault(channel.topic, topic)
             if (first.schema, first.encoding) != (topic.schema, topic.encoding):
                 raise ValueError(f"topic {channel.topic} has messages of two types, {first.schema} and {topic.schema}")
-            if number in self._messages:
+            if self._messages[number]:
                 _note_jump(content, channel.topic, self._messages[number])
                 content.messages.setdefault(channel.topic, []).extend(self._messages[number])
         for messages in content.messages.values():
@@ -269,7 +275,7 @@ def _stream(content: memoryview) -> ReadDataStream:
     return ReadDataStream(io.BytesIO(content))
 
 
-def _unpack_chunk(content: memoryview) -> memoryview:
+def _unpack_chunk(content: memoryview) -> bytes:
     """The records in a chunk, decompressed, the checksum compared."""
     _, _, size, check, name_length = CHUNK_HEAD.unpack_from(content)
     at = CHUNK_HEAD.size + name_length
@@ -289,11 +295,11 @@ def _unpack_chunk(content: memoryview) -> memoryview:
     elif compression == "lz4":
         data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
     elif compression == "":
-        data = packed
+        data = bytes(packed)
     else:
         raise ValueError(f"a chunk is compressed by {compression!r}, which lfd does not know")
     if len(data) != size:
         raise ValueError(f"a chunk unpacks to {len(data)} bytes instead of {size}")
     if check and zlib.crc32(data) != check:
         raise ValueError("the checksum of a chunk is wrong")
-    return memoryview(data)
+    return data

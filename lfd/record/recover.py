@@ -16,6 +16,7 @@ from lfd.core.errors import EpisodeError, RecordingError
 from lfd.core.protocols import Progress, silent
 from lfd.record.columns import arrays
 from lfd.record.episode_file import BEGIN, END, MEMORY, read_episode
+from lfd.record.journal import SUFFIX as JOURNAL
 from lfd.record.journal import LeftSteps, journal_of, read_journal
 from lfd.record.mcap_file import DAMAGE, SUFFIX, McapContent, Topic, salvage_mcap
 from lfd.record.mcap_writing import McapWriter
@@ -55,6 +56,9 @@ def recover(folder: Path, *, progress: Progress = silent) -> list[Recovered]:
         raise RecordingError(f"no folder {folder}")
     for unfinished in folder.rglob(f"*{RECOVERED}*"):  # of a recovery that was killed
         unfinished.unlink()
+    for journal in folder.rglob(f"*{SUFFIX}{JOURNAL}"):
+        if not journal.with_name(journal.name.removesuffix(JOURNAL) + ".part").exists():
+            journal.unlink()  # its recording was finished at the last moment
     found = sorted([*folder.rglob(f"*{PART}"), *folder.rglob(f"*{SUFFIX}")])
     done = []
     with progress("recover", len(found)) as bar:

@@ -27,6 +27,7 @@ from lfd.record.demonstrations import (
     attempts_in,
     begin_recordings,
     make_recorder,
+    numbers_in,
     take_cameras,
 )
 from lfd.record.pacing import Paced
@@ -87,7 +88,10 @@ def record_session(
     load_robot(recipe.robot)
     load_task(recipe.task)
     used = {**tables, "record": as_table(recipe), "teleop": as_table(teleop)}
-    first = max(attempts_in(out, recipe, SAME), default=-1) + 1 if resume else 0
+    first = 0
+    if resume:
+        attempts_in(out, recipe, SAME)
+        first = max(numbers_in(out, ""), default=-1) + 1  # after what a crash left, too
     if not resume:
         check_output(out, overwrite=overwrite)
     (world,) = make_worlds(recipe.task, recipe.robot, recipe.control_hz, most=1, progress=progress)
