@@ -47,6 +47,17 @@ def lift_world():
     return make_world("Lift", "panda", 20)
 
 
+@pytest.fixture(scope="session")
+def recorded(lift_world, tmp_path_factory: pytest.TempPathFactory):
+    """An episode of 40 random actions, as it is read from its recording."""
+    from lfd.record.episode_file import read_episode
+    from tests.test_record_episode_file import record_steps
+
+    path = tmp_path_factory.mktemp("recorded") / "episode.mcap"
+    record_steps(lift_world, path, np.random.default_rng(5).uniform(-0.5, 0.5, (40, 7)))
+    return read_episode(path)
+
+
 @dataclass(frozen=True)
 class Thread:
     """What each stage of the thread left on disk, and the JSON that it printed."""

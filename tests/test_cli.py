@@ -6,13 +6,17 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from lfd.cli import main
 from lfd.record.episode_file import read_episode, recordings_in
 from tests.conftest import BC, LIFT, ROOT, call_json
 
-COMMANDS = ("record", "convert", "train", "eval", "sweep", "replay", "info", "doctor", "bench", "demo")
+COMMANDS = (
+    "record", "convert", "verify", "export", "trace", "recover", "train", "eval", "sweep", "replay", "info", "doctor",
+    "bench", "demo",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -189,6 +193,98 @@ def test_a_disk_that_takes_no_more_leaves_nothing_half_written(command, thread, 
     assert "Traceback" not in done.stderr
     left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
     assert left == (["manifest.json"] if command == "record" else [])
+
+
+def test_the_way_of_the_data_in_json(recorded, tmp_path, capfd) -> None:
+    from dataclasses import replace
+
+    from tests.small_recordings import part, toml, write_all
+
+    def printed(*arguments: object) -> dict:
+        capfd.readouterr()
+        assert main([*map(str, arguments), "--json"]) == 0
+        out = capfd.readouterr().out
+        assert len(out.splitlines()) == 1
+        return json.loads(out)
+
+    a, b, out = tmp_path / "a", tmp_path / "b", tmp_path / "dataset"
+    paths = write_all(a, *(part(recorded, begin, begin + 6) for begin in (0, 6, 12)))
+    write_all(b, replace(part(recorded, 18, 24), successes=np.arange(6) == 5))
+    paths[1].write_bytes(paths[1].read_bytes()[:-600])
+    recipe = toml(tmp_path / "recipe.toml", failures=True)
+    first = printed("convert", a, "--recipe", recipe, "--out", out, "--skip-bad")
+    assert (first["out"], first["episodes"], first["frames"], first["left_out"]) == (str(out), 2, 12, 0)
+    (why,) = first["skipped"]
+    assert str(paths[1]) in why
+    again = printed("convert", b, "--append", "--jobs", "1", "--out", out)
+    assert (again["episodes"], again["frames"], again["skipped"]) == (1, 6, [])
+    verified = printed("verify", out, a, b)
+    assert verified == {"dataset": str(out), "numbers_equal": first["compared"] + again["compared"]}
+    assert printed("export", out, "--to", "mcap", "--out", tmp_path / "mcap") == {
+        "out": str(tmp_path / "mcap"),
+        "episodes": 3,
+    }
+    assert printed("export", b, "--to", "robomimic", "--out", tmp_path / "b.hdf5")["episodes"] == 1
+    traced = printed("trace", out)
+    assert [(parent["kind"], parent["state"]) for parent in traced["parents"]] == 3 * [("file", "intact")]
+    (saved,) = printed("recover", a)["files"]
+    assert (saved["path"], saved["episode"]) == (f"{paths[1]}.damaged", str(paths[1]))
+    assert main(["convert", str(a), "--recipe", str(recipe), "--out", str(tmp_path / "text"), "--skip-bad"]) == 0
+    assert "recovered" in capfd.readouterr().out  # what a person should know of an episode is shown
+
+
+def test_a_dataset_that_differs_from_its_sources_ends_with_exit_code_1(recorded, tmp_path, capfd) -> None:
+    from tests.small_recordings import part, toml, write_all
+
+    write_all(tmp_path / "a", part(recorded, 0, 6))
+    write_all(tmp_path / "b", part(recorded, 1, 7))
+    recipe, out = toml(tmp_path / "recipe.toml"), tmp_path / "out"
+    assert main(["convert", str(tmp_path / "a"), "--recipe", str(recipe), "--out", str(out)]) == 0
+    capfd.readouterr()
+    assert main(["verify", str(out), str(tmp_path / "b")]) == 1
+    captured = capfd.readouterr()
+    assert "observation.state differs from the recording in row 0; convert it again" in captured.err
+    assert captured.out == ""
+
+
+def test_bad_input_on_the_way_of_the_data(recorded, lfd_fails, tmp_path) -> None:
+    from tests.small_recordings import part, toml, write_all
+
+    write_all(tmp_path / "a", part(recorded, 0, 6))
+    a, out, none, recipe = tmp_path / "a", tmp_path / "out", tmp_path / "none", toml(tmp_path / "recipe.toml")
+    foreign = "tests/data/rosbag2parquet_base_msgs.mcap"
+    assert f"no recording {none}; `lfd record RECIPE --out {none}` makes some" in lfd_fails(
+        "convert", none, "--out", out
+    )
+    assert "no [convert] table, and no recording keeps one; name a recipe" in lfd_fails("convert", a, "--out", out)
+    assert "no recipe" in lfd_fails("convert", a, "--recipe", none, "--out", out)
+    assert "is no recording of lfd: it has no metadata 'lfd.episode'. Name a recipe with [resample]" in lfd_fails(
+        "convert", foreign, "--recipe", recipe, "--out", out
+    )
+    assert "is no dataset that could grow; leave out --append" in lfd_fails(
+        "convert", a, "--recipe", recipe, "--append", "--out", out
+    )
+    broken = tmp_path / "broken.toml"
+    broken.write_text(recipe.read_text() + "[video]\ncodec = 'mpeg2'\n")
+    assert "unknown codec in" in lfd_fails("convert", a, "--recipe", broken, "--out", out)
+    broken.write_text(recipe.read_text().replace('"action"', '"actions"'))
+    assert "'actions'; known: action, expert_action" in lfd_fails("convert", a, "--recipe", broken, "--out", out)
+    broken.write_text(recipe.read_text().replace('"action"', '"expert_action"'))
+    assert "no expert was asked in this episode" in lfd_fails("convert", a, "--recipe", broken, "--out", out)
+    broken.write_text(recipe.read_text() + "cameras = ['front']\n")
+    assert "episode_000000.mcap: unknown camera 'front'" in lfd_fails("convert", a, "--recipe", broken, "--out", out)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert "empty holds no .mcap file" in lfd_fails("convert", empty, "--recipe", recipe, "--out", out)
+    assert not out.exists()
+    assert "none is no LeRobot dataset: it has no meta/info.json" in lfd_fails("verify", none, a)
+    assert "no recording" in lfd_fails("export", none, "--to", "mcap", "--out", out)
+    assert "nothing at" in lfd_fails("trace", none)
+    assert "no folder" in lfd_fails("recover", none)
+    for text, said in (("{", "is no JSON"), ('{"codebase_version": "v2.1"}', "of version v2.1, expected v3.0")):
+        (none / "meta").mkdir(parents=True, exist_ok=True)
+        (none / "meta/info.json").write_text(text)
+        assert said in lfd_fails("verify", none, a)
 
 
 @pytest.mark.slow

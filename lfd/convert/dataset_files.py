@@ -53,7 +53,7 @@ class DatasetFiles:
         self.features: dict[str, dict[str, Any]] = self.info["features"]
         self.fps = self.info["fps"]
         self.manifest = read_manifest(root) or {}
-        self._open: tuple[tuple[int, int], int, pa.Table] | None = None
+        self._open: tuple[Path, _Rows] | None = None
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -85,9 +85,7 @@ class DatasetFiles:
     def read(self, index: int) -> StoredEpisode:
         """The rows of an episode."""
         row = self.episodes[index]
-        table, first = self._file(row["data/chunk_index"], row["data/file_index"])
-        begin = row["dataset_from_index"] - first
-        rows = table.slice(begin, row["length"])
+        rows = self._rows_of(row)
         columns, pngs = {}, {}
         for name, told in self.features.items():
             if told["dtype"] == "image":
@@ -119,15 +117,46 @@ class DatasetFiles:
             names = [name for group in names.values() for name in group]
         return tuple(names) if names else tuple(str(i) for i in range(told["shape"][0]))
 
-    def _file(self, chunk: int, file: int) -> tuple[pa.Table, int]:
-        """A file of rows and the number of its first; the last one stays open."""
-        if self._open is None or self._open[0] != (chunk, file):
-            path = self.root / self.info["data_path"].format(chunk_index=chunk, file_index=file)
-            with _reading(path):
-                table = pq.read_table(path)
-            first = table["index"][0].as_py() if len(table) else 0
-            self._open = (chunk, file), first, table
-        return self._open[2], self._open[1]
+    def _rows_of(self, row: dict[str, Any]) -> pa.Table:
+        """The rows of an episode; the file that they are in stays open for the next one."""
+        place = row["data/chunk_index"], row["data/file_index"]
+        path = self.root / self.info["data_path"].format(chunk_index=place[0], file_index=place[1])
+        with _reading(path):
+            if self._open is None or self._open[0] != path:
+                self._open = path, _Rows(path, self._first_row[place])
+            table = self._open[1].read(row["dataset_from_index"], row["dataset_to_index"])
+        if len(table) != row["length"]:
+            raise DatasetError(f"{path} ends before the last row of episode {row['episode_index']}; convert again")
+        return table
+
+    @cached_property
+    def _first_row(self) -> dict[tuple[int, int], int]:
+        """Chunk and file to the number of its first row."""
+        first: dict[tuple[int, int], int] = {}
+        for row in self.episodes:
+            place = row["data/chunk_index"], row["data/file_index"]
+            first[place] = min(row["dataset_from_index"], first.get(place, row["dataset_from_index"]))
+        return first
+
+
+class _Rows:
+    """The rows of a Parquet file, of which only the row groups that are asked for are read."""
+
+    def __init__(self, path: Path, first: int):
+        self._file = pq.ParquetFile(path)
+        about = self._file.metadata
+        sizes = [about.row_group(i).num_rows for i in range(about.num_row_groups)]
+        self._ends = first + np.cumsum(sizes, dtype=int)
+        self._begins = self._ends - sizes
+        self._last: tuple[tuple[int, ...], pa.Table] | None = None
+
+    def read(self, begin: int, end: int) -> pa.Table:
+        """The rows from number `begin` to `end` of the dataset."""
+        groups = tuple(np.flatnonzero((self._begins < end) & (self._ends > begin)).tolist())
+        if self._last is None or self._last[0] != groups:
+            self._last = groups, self._file.read_row_groups(list(groups), use_threads=False)
+        offset = begin - int(self._begins[groups[0]]) if groups else 0
+        return self._last[1].slice(offset, end - begin)
 
 
 @contextmanager

@@ -55,10 +55,17 @@ def frames_of_episode(
 ) -> EpisodeFrames:
     """The rows 0 to T - 1 of an episode: each action with the observation before it.
 
-    Raises `UnknownName` for a channel or camera that the episode does not have, `DatasetError` when the recipe wants
-    the expert's actions and there are none, or when a time is off its step.
+    Raises `DatasetError` for a channel or camera that the episode does not have, when the recipe wants the expert's
+    actions and there are none, or when a time is off its step.
     """
     _check_clock(episode, source)
+    try:
+        return _frames(episode, recipe, source, notes or {})
+    except UnknownName as error:
+        raise DatasetError(f"{source}: {error}") from error
+
+
+def _frames(episode: Episode, recipe: ConvertRecipe, source: str, notes: Mapping[str, Any]) -> EpisodeFrames:
     action = CHANNELS["action"]
     actions = episode.actions if recipe.action == "action" else episode.expert_actions
     if actions is None:
@@ -98,7 +105,7 @@ def frames_of_episode(
             "task": about.task,
             "control_hz": about.control_hz,
         },
-        notes={**said, **(notes or {})},
+        notes={**said, **notes},
         recipe={**about.recipe, "convert": as_table(recipe)},
         model_xml=episode.model_xml,
     )

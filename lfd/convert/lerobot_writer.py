@@ -22,6 +22,8 @@ from lfd.core.errors import DatasetError
 VERSION = "v3.0"
 FILE_BYTES = 100 * 2**20
 """Size at which a file of rows is closed and the next one begun."""
+FILE_EPISODES = 250
+"""Episodes after which it is closed too: what Parquet keeps of each row group stays in memory until then."""
 FILES_PER_CHUNK = 1000
 BATCH = 100
 """Episodes whose descriptions are written at once."""
@@ -97,7 +99,7 @@ class DatasetWriter:
             "index": np.arange(self.frames, self.frames + length)[:, None],
             "task_index": np.full((length, 1), task),
         }
-        if self._rows is None or self._rows.size >= FILE_BYTES:
+        if self._rows is None or self._rows.size >= FILE_BYTES or self._rows.count >= FILE_EPISODES:
             self._next_file()
         assert self._rows is not None
         self._rows.write(pa.table(self._arrays(episode, own), schema=self._rows.schema))
@@ -211,6 +213,8 @@ class _Parquet:
         self.schema = schema
         self._stream = path.open("wb")
         self._writer = pq.ParquetWriter(self._stream, schema, compression="snappy")
+        self.count = 0
+        """Row groups so far."""
 
     @property
     def size(self) -> int:
@@ -218,6 +222,7 @@ class _Parquet:
 
     def write(self, table: pa.Table) -> None:
         self._writer.write_table(table)
+        self.count += 1
 
     def close(self) -> None:
         try:

@@ -1,11 +1,14 @@
 """A map over processes of this machine; `lfd.cluster` has the same over machines."""
 
 import os
+import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from contextlib import contextmanager
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 from lfd.core.errors import LfdError
@@ -44,13 +47,27 @@ class ProcessMap:
                 while waiting or running:
                     while waiting and len(running) < 2 * self.cpus:
                         index, unit = waiting.popleft()
-                        running.append((index, pool.submit(_call, unit)))
+                        with _deaf_to_ctrl_c():
+                            running.append((index, pool.submit(_call, unit)))
                     index, future = running.popleft()
                     yield index, future.result()
             except BrokenProcessPool as error:
                 raise LfdError("a worker process died, for example for lack of memory; try it with --jobs 1") from error
             finally:
                 pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Processes that start meanwhile leave Ctrl-C, which the terminal sends to all, to this one, which ends them."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 _work: tuple[Callable[[Any, Any], Any], Any] | None = None
@@ -62,6 +79,15 @@ def _begin(function: Callable[[Any, Any], Any], shared: Any) -> None:
     for name in THREADS:
         os.environ[name] = "1"
     _work = function, shared
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A process whose parent was killed would wait for work for ever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _call(unit: Any) -> Any:

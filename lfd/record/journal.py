@@ -74,9 +74,8 @@ class Journal:
         self.count = 0
 
     def remove(self) -> None:
-        """Delete the file."""
-        del self._numbers, self._head
-        self._map.close()
+        """Delete the file; its memory goes with the last view of it, which may be that of an error."""
+        del self._numbers, self._head, self._map
         self._path.unlink(missing_ok=True)
 
 

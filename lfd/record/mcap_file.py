@@ -254,6 +254,8 @@ class _Reading:
             topic = Topic(channel.message_encoding, *told, channel.metadata)
             first = content.topics.setdefault(channel.topic, topic)
             if (first.schema, first.encoding) != (topic.schema, topic.encoding):
+                if not check:  # the record that describes the channel is damaged
+                    continue
                 raise ValueError(f"topic {channel.topic} has messages of two types, {first.schema} and {topic.schema}")
             if self._messages[number]:
                 _note_jump(content, channel.topic, self._messages[number])
