@@ -42,7 +42,7 @@ def about(path: Path) -> dict[str, Any]:
 
 
 def _about_hdf5(path: Path) -> dict[str, Any]:
-    from lfd.convert.hdf5_file import read_file
+    from lfd.convert.hdf5.demo_file import read_file
 
     file = read_file(path, trust_rows=True)
     facts = {"kind": f"HDF5 demonstrations of {file.layout}", "bytes": path.stat().st_size}
@@ -54,7 +54,7 @@ def _about_hdf5(path: Path) -> dict[str, Any]:
 def _about_recipe(path: Path) -> dict[str, Any]:
     """Every key that the recipe's tables know, with its value and its meaning."""
     from lfd.convert.features import ConvertRecipe
-    from lfd.convert.mapping import ResampleRecipe, map_recipe
+    from lfd.convert.foreign.mapping import ResampleRecipe, map_recipe
     from lfd.policies.registry import recipe_class
     from lfd.record.demonstrations import RecordRecipe
     from lfd.run.evaluate import EvalRecipe

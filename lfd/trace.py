@@ -47,8 +47,14 @@ def _origin(path: Path, noted: str | None) -> Origin:
     if manifest is None:
         return Origin(path=str(path), kind="file" if path.is_file() else "folder", state=state, made="", parents=())
     made = f"{manifest.get('made', '')}, commit {manifest.get('commit') or 'unknown'}, seed {manifest.get('seed')}"
-    parents = tuple(_origin(Path(parent), digest) for parent, digest in manifest.get("parents", {}).items())
+    parents = tuple(_origin(_found(parent, path), digest) for parent, digest in manifest.get("parents", {}).items())
     return Origin(path=str(path), kind=str(manifest.get("kind")), state=state, made=made, parents=parents)
+
+
+def _found(parent: str, child: Path) -> Path:
+    """The path of a parent as it was noted: from here, or from one of the folders that its child is in."""
+    places = (Path(), *child.resolve().parents)
+    return next((place / parent for place in places if (place / parent).exists()), Path(parent))
 
 
 def as_json(origin: Origin) -> dict[str, Any]:

@@ -12,9 +12,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from lfd.convert.dataset_files import DatasetFiles
+from lfd.convert.dataset.dataset_files import DatasetFiles
 from lfd.convert.exporting import export
-from lfd.convert.hdf5_file import read_demo, read_file
+from lfd.convert.hdf5.demo_file import read_demo, read_file
 from lfd.convert.sources import SourceRecipe, episode_in, units_of
 from lfd.convert.to_lerobot import convert
 from lfd.core.errors import InputError, OutputError

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from lfd.about import about
-from lfd.convert.foreign_mcap import bags_in, frames_of_mcap
+from lfd.convert.foreign.bags import bags_in, frames_of_mcap
+from lfd.convert.foreign.mapping import MapRecipe, map_recipe
 from lfd.convert.frames import EpisodeFrames
-from lfd.convert.mapping import MapRecipe, map_recipe
-from lfd.core.errors import RecordingError
+from lfd.core.errors import RecipeError, RecordingError
 from lfd.record.mcap_file import read_mcap
 from lfd.record.topic_rates import topic_rates
 from tests.foreign_bags import (
@@ -502,8 +502,8 @@ def test_a_real_bag() -> None:
 
 def test_real_pictures() -> None:
     """One raw and one compressed picture: no episode, but they decode."""
-    from lfd.convert.mapping import MapEntry
-    from lfd.convert.message_samples import samples_of_topic
+    from lfd.convert.foreign.mapping import MapEntry
+    from lfd.convert.foreign.message_samples import samples_of_topic
 
     content = read_mcap(DATA / "rerun_rosbag2_all_sensor_msgs.mcap")
     for topic, shape in (("/image", (480, 640, 3)), ("/compressed_image", (480, 640, 3))):
@@ -562,3 +562,16 @@ def test_a_log_clock_that_jumps_back(bag: Callable[..., Path]) -> None:
     commands.messages[4:6] = [(second, data), (first, other)]
     text = refusal(bag(joints_at(np.arange(0, 2, 0.01)), commands), recipe(("arm", "command")))
     assert "topic /command: the log clock jumps back by 0.1 s at log time" in text
+
+
+def test_a_task_that_the_recording_says(bag: Callable[..., Path]) -> None:
+    told = ros("/task", "std_msgs/msg/String", [(START_NS, {"data": "stir the soup"})])
+    path, asked = bag(joints_at(np.arange(0, 1, 0.01)), told), {"task": "", "task_topic": "/task"}
+    assert one(frames_of_mcap([path], recipe(("arm",), asked))).task == "stir the soup"
+    silent = bag(joints_at(np.arange(0, 1, 0.01)))
+    assert "no messages on topic /task, which [resample] task_topic names" in refusal(silent, recipe(("arm",), asked))
+    text = refusal(path, recipe(("arm",), {**asked, "task_topic": "/joint_states"}))
+    assert "topic /joint_states holds no text in its field data" in text
+    for wrong in ({"task": ""}, {"task_topic": "/task"}):
+        with pytest.raises(RecipeError, match="needs task, the instruction in words, or task_topic"):
+            recipe(("arm",), wrong)

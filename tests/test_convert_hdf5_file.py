@@ -7,11 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
-from lfd.convert import hdf5_process
-from lfd.convert.hdf5_file import rate_of, read_demo, read_file
-from lfd.convert.hdf5_samples import frames_of_demo
-from lfd.convert.hdf5_worker import TIMES_FILE
-from lfd.convert.mapping import map_recipe
+from lfd.convert.foreign.mapping import map_recipe
+from lfd.convert.hdf5 import reading as hdf5_process
+from lfd.convert.hdf5.demo_file import rate_of, read_demo, read_file
+from lfd.convert.hdf5.stored_samples import frames_of_demo
+from lfd.convert.hdf5.worker import TIMES_FILE
 from lfd.core.errors import EpisodeError, RecordingError, UnknownName
 from tests.hdf5_files import DAMAGED, LIFT, REACHING, ROWS, STACK, mutated, opened, small_file
 
@@ -216,7 +216,7 @@ def test_ten_thousand_damaged_files_get_an_answer_each(tmp_path: Path, monkeypat
         grown.append(answer.growth - TIMES_FILE * path.stat().st_size)
         return answer
 
-    monkeypatch.setattr("lfd.convert.hdf5_file.ask", watched)
+    monkeypatch.setattr("lfd.convert.hdf5.demo_file.ask", watched)
     rng, outcomes, slowest = np.random.default_rng(1), Counter(), 0.0
     for number in range(10_000):
         path = tmp_path / "case.hdf5"

@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from lfd.convert.hdf5_file import read_demo, read_file
-from lfd.convert.hdf5_replay import Replayed, replay_demo
-from lfd.convert.recorded_model import places, skeleton
+from lfd.convert.hdf5.demo_file import read_demo, read_file
+from lfd.convert.hdf5.recorded_model import places, skeleton
+from lfd.convert.hdf5.replay import Replayed, replay_demo
 from lfd.core.errors import EpisodeError, RecordingError, UnknownName
 from lfd.worlds.environments import controller_configs, make_environment, robots_of
 from lfd.worlds.robots import load_robot

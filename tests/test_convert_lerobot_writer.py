@@ -10,14 +10,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from lfd.convert import lerobot_writer
-from lfd.convert.dataset_files import DatasetFiles
+from lfd.convert.dataset import lerobot_writer
+from lfd.convert.dataset.dataset_files import DatasetFiles
+from lfd.convert.dataset.lerobot_writer import BATCH, dataset_writer
+from lfd.convert.dataset.statistics import QUANTILES, column_stats
+from lfd.convert.dataset.video import VideoRecipe
 from lfd.convert.frames import EpisodeFrames
-from lfd.convert.lerobot_writer import BATCH, dataset_writer
 from lfd.convert.prepared import PreparedEpisode, prepare
 from lfd.convert.sources import frames_of, units_of
-from lfd.convert.statistics import QUANTILES, column_stats
-from lfd.convert.video import VideoRecipe
 from lfd.core.errors import DatasetError
 from tests.small_recordings import FEATURE, filmed, part, recipe, write_all
 

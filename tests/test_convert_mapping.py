@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lfd.convert.field_path import meet, members_of, parse_field
-from lfd.convert.mapping import TABLES, map_recipe
-from lfd.convert.units import UNITS, defined_dimensions, suspicion
+from lfd.convert.foreign.field_path import meet, members_of, parse_field
+from lfd.convert.foreign.mapping import TABLES, map_recipe
+from lfd.convert.foreign.units import UNITS, defined_dimensions, suspicion
 from lfd.core.errors import InputError
 from lfd.core.recipe import load_toml
 

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lfd.convert.field_path import parse_field
-from lfd.convert.mapping import MapEntry
-from lfd.convert.message_decoding import decode_message, decoder_of
-from lfd.convert.message_fields import frame_of, numbers_at, stamp_of
-from lfd.convert.message_samples import samples_of_topic
-from lfd.convert.samples import Samples
+from lfd.convert.foreign.field_path import parse_field
+from lfd.convert.foreign.mapping import MapEntry
+from lfd.convert.foreign.message_decoding import decode_message, decoder_of
+from lfd.convert.foreign.message_fields import frame_of, numbers_at, stamp_of
+from lfd.convert.foreign.message_samples import samples_of_topic
+from lfd.convert.foreign.samples import Samples
 from lfd.core.errors import RecordingError
 from lfd.record import cdr
 from lfd.record.mcap_file import Topic

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lfd.convert.resample import hold, linear, longest_interval, nearest, rows_between, slerp
+from lfd.convert.foreign.resample import hold, linear, longest_interval, nearest, rows_between, slerp
 
 STEPS = st.lists(st.integers(2_000, 400_000), min_size=1, max_size=30)
 """Microseconds between samples; further apart than what counts as the same instant."""

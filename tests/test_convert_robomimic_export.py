@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lfd.convert.features import ConvertRecipe, frames_of_episode
-from lfd.convert.hdf5_file import read_demo, read_file
-from lfd.convert.hdf5_replay import replay_demo
-from lfd.convert.robomimic_export import export_episodes, export_frames
+from lfd.convert.hdf5.demo_file import read_demo, read_file
+from lfd.convert.hdf5.replay import replay_demo
+from lfd.convert.hdf5.robomimic_export import export_episodes, export_frames
 from lfd.core.episode import Episode
 from lfd.core.errors import DatasetError, OutputError
 from lfd.core.rotations import xyzw_from_wxyz

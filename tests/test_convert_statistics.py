@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from lfd.convert.statistics import (
+from lfd.convert.dataset.statistics import (
     QUANTILES,
     SAMPLED_PICTURES,
     SAMPLED_SIDE,

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from lfd.convert.dataset_files import DatasetFiles
+from lfd.convert.dataset.dataset_files import DatasetFiles
 from lfd.convert.to_lerobot import convert
 from lfd.convert.verify import verify
 from lfd.core.episode import Episode

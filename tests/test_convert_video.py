@@ -11,10 +11,10 @@ import av
 import numpy as np
 import pytest
 
-from lfd.convert.dataset_files import DatasetFiles
+from lfd.convert.dataset.dataset_files import DatasetFiles
+from lfd.convert.dataset.video import VideoRecipe, decode_video, encode_video, video_info
 from lfd.convert.to_lerobot import convert
 from lfd.convert.verify import verify
-from lfd.convert.video import VideoRecipe, decode_video, encode_video, video_info
 from lfd.core.errors import DatasetError, LfdError, RecipeError, UnknownName, VerificationError
 from lfd.record.png import decode_png
 from tests.small_recordings import CAMERA, FEATURE, filmed, part, recipe, write_all
@@ -232,7 +232,7 @@ def test_settings_that_no_encoder_has() -> None:
 def test_encoders_say_nothing() -> None:
     """In a process of its own: LeRobot lets FFmpeg speak."""
     code = (
-        "import numpy as np\nfrom lfd.convert.video import *\n"
+        "import numpy as np\nfrom lfd.convert.dataset.video import *\n"
         "pictures = [np.zeros((64, 64, 3), np.uint8)] * 3\n"
         "for codec in CODECS: encode_video(pictures, 20, VideoRecipe(codec=codec), 'a')"
     )

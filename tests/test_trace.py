@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from lfd.cli import main
+from lfd.convert.to_lerobot import convert
 from lfd.core.artifact import sha256, write_manifest
 from lfd.core.errors import InputError
 from lfd.record.episode_file import recordings_in
@@ -87,3 +88,11 @@ def test_paths_without_an_origin_are_refused(tmp_path, thread) -> None:
     (tmp_path / "manifest.json").write_text("{")
     with pytest.raises(InputError, match="manifest.json is no JSON"):
         trace(tmp_path)
+
+
+def test_a_chain_noted_with_relative_paths_is_found_from_anywhere(thread, tmp_path, monkeypatch) -> None:
+    shutil.copytree(thread.recordings, tmp_path / "work" / "recordings")
+    monkeypatch.chdir(tmp_path / "work")
+    convert([Path("recordings")], Path("dataset"))
+    monkeypatch.chdir(tmp_path)
+    assert {parent.state for parent in trace(Path("work/dataset")).parents} == {"intact"}

@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from lfd.convert.dataset.lerobot_writer import dataset_writer
 from lfd.convert.features import ConvertRecipe
 from lfd.convert.frames import EpisodeFrames
-from lfd.convert.lerobot_writer import dataset_writer
 from lfd.convert.prepared import prepare
 from lfd.convert.sources import SourceRecipe, frames_of, units_of
 from lfd.convert.to_lerobot import convert
@@ -33,10 +33,12 @@ from lfd.worlds.rollout import episode_rng, rollout
 STATE = ("joint_pos", "joint_vel", "gripper_pos", "gripper_vel", "ee_pos", "ee_quat")
 STEPS = 200
 MEMORY = """
-import resource, sys
+import sys
+from pathlib import Path
 from lfd.cli import main
 main(sys.argv[1:])
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+peak = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
+print(peak[0].split()[1])
 """
 
 

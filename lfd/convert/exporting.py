@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from lfd.convert.dataset_files import DatasetFiles
+from lfd.convert.dataset.dataset_files import DatasetFiles
+from lfd.convert.dataset.lerobot_writer import INFO, OWN
 from lfd.convert.frames import EpisodeFrames
-from lfd.convert.lerobot_writer import INFO, OWN
+from lfd.convert.hdf5.robomimic_export import export_episodes, export_frames
 from lfd.convert.mcap_export import export_mcap
-from lfd.convert.robomimic_export import export_episodes, export_frames
 from lfd.convert.sources import SourceRecipe, Unit, episode_in, hashes, units_of
 from lfd.core.artifact import new_folder, write_manifest
 from lfd.core.errors import InputError

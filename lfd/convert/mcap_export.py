@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lfd.convert.dataset_files import DatasetFiles, StoredEpisode
+from lfd.convert.dataset.dataset_files import DatasetFiles, StoredEpisode
 from lfd.core.artifact import new_folder, sha256, write_manifest
 from lfd.core.channels import ARRAY, IMAGE
 from lfd.core.protocols import Progress, silent
@@ -90,8 +90,8 @@ def _recipe(files: DatasetFiles) -> str:
         f"# Converts these files back: lfd convert . --recipe {RECIPE} --out DATASET",
         "[resample]",
         f"fps = {files.fps}",
-        f"task = {json.dumps(files.tasks.get(0, ''))}",
-        f"robot = {json.dumps(files.info.get('robot_type') or '')}",
+        'task_topic = "/task"',
+        f"robot = {json.dumps(files.info.get('robot_type') or 'unknown')}",
         f"max_gap_s = {1.5 / files.fps}",
     ]
     for name, told in files.features.items():

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from lfd.convert.dataset.statistics import Stats, column_stats, picture_stats, sampled_rows
+from lfd.convert.dataset.video import PNG, VideoRecipe, encode_video, video_info
 from lfd.convert.frames import EpisodeFrames, Pictures
-from lfd.convert.statistics import Stats, column_stats, picture_stats, sampled_rows
-from lfd.convert.video import PNG, VideoRecipe, encode_video, video_info
 from lfd.core.errors import DatasetError
 from lfd.record.png import encode_png
 

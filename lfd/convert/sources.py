@@ -10,11 +10,11 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from lfd.convert.dataset.video import VideoRecipe
 from lfd.convert.features import ConvertRecipe, frames_of_episode
-from lfd.convert.foreign_mcap import bags_in, frames_of_content, joined
+from lfd.convert.foreign.bags import bags_in, frames_of_content, joined
+from lfd.convert.foreign.mapping import MapRecipe, map_recipe
 from lfd.convert.frames import EpisodeFrames
-from lfd.convert.mapping import MapRecipe, map_recipe
-from lfd.convert.video import VideoRecipe
 from lfd.core.artifact import sha256
 from lfd.core.episode import Episode
 from lfd.core.errors import RecipeError, RecordingError
@@ -186,8 +186,8 @@ def _demos_in(file: Path, recipe: SourceRecipe) -> Iterator[Unit]:
 
 
 def _hdf5(file: Path, recipe: SourceRecipe) -> Any:
-    """What an HDF5 file says of its demonstrations (`lfd.convert.hdf5_file.DemoFile`)."""
-    from lfd.convert.hdf5_file import read_file
+    """What an HDF5 file says of its demonstrations (`lfd.convert.hdf5.demo_file.DemoFile`)."""
+    from lfd.convert.hdf5.demo_file import read_file
 
     return read_file(file, trust_rows=recipe.trust_rows or recipe.trust_total)
 
@@ -215,7 +215,7 @@ def frames_of(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
 
 
 def _frames_of_demo(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
-    from lfd.convert.hdf5_samples import frames_of_demo
+    from lfd.convert.hdf5.stored_samples import frames_of_demo
 
     file = _hdf5(unit.paths[0], recipe)
     if recipe.is_mapping:
@@ -227,9 +227,9 @@ def _frames_of_demo(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
 
 
 def _replayed(unit: Unit, recipe: SourceRecipe) -> Any:
-    """A demonstration that went through the simulator (`lfd.convert.hdf5_replay.Replayed`)."""
-    from lfd.convert.hdf5_file import read_demo
-    from lfd.convert.hdf5_replay import replay_demo
+    """A demonstration that went through the simulator (`lfd.convert.hdf5.replay.Replayed`)."""
+    from lfd.convert.hdf5.demo_file import read_demo
+    from lfd.convert.hdf5.replay import replay_demo
 
     file = _hdf5(unit.paths[0], recipe)
     return replay_demo(file, read_demo(file, unit.demo, obs=(), trust_rows=recipe.trust_rows))

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from lfd.convert.lerobot_writer import INFO, DatasetWriter, dataset_writer
+from lfd.convert.dataset.lerobot_writer import INFO, DatasetWriter, dataset_writer
 from lfd.convert.prepared import PreparedEpisode, prepare
 from lfd.convert.sources import PackedUnit, SourceRecipe, Unit, frames_of, hashes, units_of
 from lfd.convert.verify import Placed, verify_placed

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lfd.convert.dataset_files import DatasetFiles
+from lfd.convert.dataset.dataset_files import DatasetFiles
+from lfd.convert.dataset.lerobot_writer import INFO
 from lfd.convert.frames import EpisodeFrames, Pictures
-from lfd.convert.lerobot_writer import INFO
 from lfd.convert.sources import SourceRecipe, Unit, frames_of, units_of
 from lfd.core.errors import VerificationError
 from lfd.core.processes import ProcessMap

@@ -1,4 +1,4 @@
-"""Asks the process that opens HDF5 files (`lfd.convert.hdf5_worker`), and starts another one when a file ends it."""
+"""Asks the process that opens HDF5 files (`lfd.convert.hdf5.worker`), and starts another one when a file ends it."""
 
 import atexit
 import json
@@ -18,7 +18,7 @@ import numpy as np
 
 from lfd.core.errors import RecordingError
 
-PROGRAM = Path(__file__).with_name("hdf5_worker.py")
+PROGRAM = Path(__file__).with_name("worker.py")
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 ADVICE = "the file is damaged: take it from its source again, or leave it out"
 

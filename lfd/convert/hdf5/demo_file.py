@@ -9,7 +9,7 @@ Two layouts, which differ in what stands beside the demonstrations:
     data/demo_1/states       (T, 1 + nq + nv): time, qpos, qvel before each action
     data/demo_1/obs/NAME     (T, ...), robomimic
 
-The file is opened in a process of its own, bounded in time and memory (`lfd.convert.hdf5_process`).
+The file is opened in a process of its own, bounded in time and memory (`lfd.convert.hdf5.reading`).
 """
 
 import json
@@ -23,7 +23,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from lfd.convert.hdf5_process import ask
+from lfd.convert.hdf5.reading import ask
 from lfd.core.errors import EpisodeError, RecordingError, UnknownName
 
 SKIP = "--skip-bad leaves it out"

@@ -1,4 +1,4 @@
-"""The process in which HDF5 files are opened; `lfd.convert.hdf5_file` starts it and puts its answers into words.
+"""The process in which HDF5 files are opened; `lfd.convert.hdf5.demo_file` starts it and puts its answers into words.
 
 libhdf5 can crash, loop, or ask for gigabytes when a file is damaged. Here that ends a process that has nothing else
 to do. A request is a line of JSON on standard input with `path`, `demo` (null: the file as a whole) and `obs` (names

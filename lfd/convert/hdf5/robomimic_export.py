@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from lfd.convert.frames import EpisodeFrames
-from lfd.convert.hdf5_writing import new_hdf5
-from lfd.convert.robomimic_demo import RobomimicDemo, demo_of_episode, demo_of_frames
+from lfd.convert.hdf5.robomimic_demo import RobomimicDemo, demo_of_episode, demo_of_frames
+from lfd.convert.hdf5.writing import new_hdf5
 from lfd.core.artifact import versions
 from lfd.core.episode import Episode
 from lfd.core.errors import DatasetError

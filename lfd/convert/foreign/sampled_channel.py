@@ -7,11 +7,11 @@ from math import pi
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from lfd.convert import resample
-from lfd.convert.field_path import meet
-from lfd.convert.mapping import MapEntry
-from lfd.convert.samples import Samples, is_quaternion, unit_quaternions
-from lfd.convert.units import UNITS
+from lfd.convert.foreign import resample
+from lfd.convert.foreign.field_path import meet
+from lfd.convert.foreign.mapping import MapEntry
+from lfd.convert.foreign.samples import Samples, is_quaternion, unit_quaternions
+from lfd.convert.foreign.units import UNITS
 from lfd.core.errors import RecordingError
 
 

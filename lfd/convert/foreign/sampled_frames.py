@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from lfd.convert import resample
+from lfd.convert.foreign import resample
+from lfd.convert.foreign.mapping import MapEntry, MapRecipe, ResampleRecipe
+from lfd.convert.foreign.sampled_channel import Channel, Gap, Rows, channel_of, gaps_of, refuse_doubles, rows_of
+from lfd.convert.foreign.samples import Samples, checked
+from lfd.convert.foreign.units import UNITS
 from lfd.convert.frames import EpisodeFrames, Pictures
-from lfd.convert.mapping import MapEntry, MapRecipe, ResampleRecipe
-from lfd.convert.sampled_channel import Channel, Gap, Rows, channel_of, gaps_of, refuse_doubles, rows_of
-from lfd.convert.samples import Samples, checked
-from lfd.convert.units import UNITS
 from lfd.core.errors import RecordingError
 
 SamplesOf = Callable[[MapEntry], Samples]
@@ -37,8 +37,8 @@ def frames_of_samples(
 
     `source` names the recording in messages; `about`, `notes` and `model_xml` are added to every episode.
 
-    Raises `RecordingError` for samples that cannot be right (`lfd.convert.samples.checked`), channels that share no
-    time, and, unless the recipe splits, a gap longer than it allows.
+    Raises `RecordingError` for samples that cannot be right (`checked` of `samples`), channels that share no time,
+    and, unless the recipe splits, a gap longer than it allows.
     """
     channels = [
         channel_of(name, entry, checked(samples_of(entry), name, entry), recipe.max_gap_s(name))

@@ -10,8 +10,8 @@ from itertools import combinations
 from math import inf
 from typing import Any
 
-from lfd.convert.field_path import Step, meet, parse_field
-from lfd.convert.units import UNITS
+from lfd.convert.foreign.field_path import Step, meet, parse_field
+from lfd.convert.foreign.units import UNITS
 from lfd.core.errors import RecipeError, UnknownName
 from lfd.core.recipe import build
 
@@ -30,12 +30,14 @@ class ResampleRecipe:
 
     fps: int
     """Rows a second of the dataset [Hz]."""
-    task: str
-    """What the robot is told to do, in words."""
     robot: str
     """LeRobot's robot_type."""
     max_gap_s: float
     """Longest time without a message that may be bridged [s]."""
+    task: str = ""
+    """What the robot is told to do, in words."""
+    task_topic: str = ""
+    """Topic whose first message, a std_msgs/String, says it in the place of `task`."""
     clock: str = "header"
     """Time of a message: `header`, its own stamp (or the log time, where that is 0), or `log`, when it was logged."""
     on_gap: str = "refuse"
@@ -52,9 +54,10 @@ class ResampleRecipe:
             raise RecipeError(f"{where} max_gap_s = {self.max_gap_s}: expected seconds above 0")
         if self.min_frames < 2:
             raise RecipeError(f"{where} min_frames = {self.min_frames}: an episode has at least 2 rows")
-        for key in ("task", "robot"):
-            if not getattr(self, key).strip():
-                raise RecipeError(f"{where} {key} is empty")
+        if not self.robot.strip():
+            raise RecipeError(f"{where} robot is empty")
+        if bool(self.task.strip()) == bool(self.task_topic):
+            raise RecipeError(f"{where} needs task, the instruction in words, or task_topic, a topic that says it")
 
 
 @dataclass(frozen=True, kw_only=True)

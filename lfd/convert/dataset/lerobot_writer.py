@@ -14,8 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from lfd.convert.dataset.statistics import Stats, aggregate, column_stats
 from lfd.convert.prepared import PreparedEpisode
-from lfd.convert.statistics import Stats, aggregate, column_stats
 from lfd.core.artifact import write_json
 from lfd.core.errors import DatasetError
 

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import UInt8
 
-from lfd.convert.field_path import Step
+from lfd.convert.foreign.field_path import Step
+from lfd.convert.foreign.mapping import QUATERNION, MapEntry, MapRecipe
+from lfd.convert.foreign.sampled_frames import frames_of_samples
+from lfd.convert.foreign.samples import Samples
 from lfd.convert.frames import EpisodeFrames, Pictures
-from lfd.convert.hdf5_file import Demo, DemoFile, rate_of, read_demo
-from lfd.convert.mapping import QUATERNION, MapEntry, MapRecipe
-from lfd.convert.sampled_frames import frames_of_samples
-from lfd.convert.samples import Samples
+from lfd.convert.hdf5.demo_file import Demo, DemoFile, rate_of, read_demo
 from lfd.core.errors import RecipeError, UnknownName
 from lfd.core.rotations import wxyz_from_xyzw
 

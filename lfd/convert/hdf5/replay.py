@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lfd.convert.demo_setting import setting_of
-from lfd.convert.demo_start import DemoStart, start_of
-from lfd.convert.hdf5_file import SKIP, Demo, DemoFile
+from lfd.convert.hdf5.demo_file import SKIP, Demo, DemoFile
+from lfd.convert.hdf5.demo_setting import setting_of
+from lfd.convert.hdf5.demo_start import DemoStart, start_of
 from lfd.core.artifact import versions
 from lfd.core.episode import Episode, EpisodeMetadata
 from lfd.core.errors import EpisodeError

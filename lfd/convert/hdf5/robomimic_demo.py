@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from lfd.convert.frames import EpisodeFrames
-from lfd.convert.recorded_model import skeleton
+from lfd.convert.hdf5.recorded_model import skeleton
 from lfd.core.channels import CHANNELS, ENVIRONMENT_STATE, STATE, WXYZ, channel
 from lfd.core.episode import Episode
 from lfd.core.rotations import xyzw_from_wxyz

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int64
 
+from lfd.convert.foreign.mapping import QUATERNION, MapEntry
+from lfd.convert.foreign.units import UNITS, suspicion
 from lfd.convert.frames import Pictures
-from lfd.convert.mapping import QUATERNION, MapEntry
-from lfd.convert.units import UNITS, suspicion
 from lfd.core.errors import RecordingError
 
 UNIT_NORM = 1e-2
@@ -36,7 +36,7 @@ class Samples:
     pictures: Pictures | None = None
     """The N pictures."""
     unit: str = ""
-    """Unit by the source's own word, in the words of `lfd.convert.units`; empty where it says nothing."""
+    """Unit by the source's own word, in the words of `lfd.convert.foreign.units`; empty where it says nothing."""
     dimensions: tuple[str, ...] = ()
     """What the numbers may be by definition of their type, such as angle; none where it says nothing."""
     frames: Mapping[str, int] = field(default_factory=dict)

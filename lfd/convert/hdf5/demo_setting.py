@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lfd.convert.hdf5_file import SKIP, Demo, DemoFile, rate_of
+from lfd.convert.hdf5.demo_file import SKIP, Demo, DemoFile, rate_of
 from lfd.core.errors import EpisodeError, RecordingError, UnknownName
 from lfd.worlds.robots import CONTROLLERS, RobotConfig, load_robot, robot_names
 from lfd.worlds.tasks import TASKS, load_task

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from lfd.convert.message_decoding import UNDECODABLE, decode_message, decoder_of, log_time
-from lfd.convert.message_fields import stamp_of
+from lfd.convert.foreign.message_decoding import UNDECODABLE, decode_message, decoder_of, log_time
+from lfd.convert.foreign.message_fields import stamp_of
 from lfd.core.errors import RecordingError
 from lfd.record.mcap_file import Topic
 

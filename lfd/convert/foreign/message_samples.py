@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from lfd.convert.field_path import Step, members_of
+from lfd.convert.foreign.field_path import Step, members_of
+from lfd.convert.foreign.mapping import MapEntry
+from lfd.convert.foreign.message_decoding import UNDECODABLE, Decoder, decode_message, decoder_of, log_time
+from lfd.convert.foreign.message_fields import frame_of, numbers_at, stamp_of
+from lfd.convert.foreign.message_pictures import MessagePictures, holds_picture
+from lfd.convert.foreign.samples import Samples
+from lfd.convert.foreign.units import defined_dimensions
 from lfd.convert.frames import Pictures
-from lfd.convert.mapping import MapEntry
-from lfd.convert.message_decoding import UNDECODABLE, Decoder, decode_message, decoder_of, log_time
-from lfd.convert.message_fields import frame_of, numbers_at, stamp_of
-from lfd.convert.message_pictures import MessagePictures, holds_picture
-from lfd.convert.samples import Samples
-from lfd.convert.units import defined_dimensions
 from lfd.core.errors import RecordingError
 from lfd.record.mcap_file import Topic
 

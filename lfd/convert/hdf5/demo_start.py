@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from lfd.convert import recorded_model
-from lfd.convert.hdf5_file import Demo
+from lfd.convert.hdf5 import recorded_model
+from lfd.convert.hdf5.demo_file import Demo
 from lfd.core.errors import EpisodeError
 from lfd.core.protocols import WorldState
 from lfd.worlds.cameras import load_model

@@ -1,21 +1,23 @@
 """MCAP files of other programs (ROS 2 bags, Foxglove, JSON) to episodes, through the mapping of a recipe.
 
     bags = bags_in([Path("demos")])                         # each a file, or the files of one ROS 2 bag
-    recipe = map_recipe(load_toml(path, TABLES), str(path))  # lfd.convert.mapping
+    recipe = map_recipe(load_toml(path, TABLES), str(path))  # lfd.convert.foreign.mapping
     episodes = frames_of_mcap(bags[0], recipe)               # one, or the pieces between gaps
 
-The rows are made by `lfd.convert.sampled_frames.frames_of_samples(recipe, source, samples_of)`, which takes any source:
-`samples_of(entry)` returns the `lfd.convert.samples.Samples` that it has for a `[map.NAME]`.
+The rows are made by `frames_of_samples(recipe, source, samples_of)` of `sampled_frames`, which takes any source:
+`samples_of(entry)` returns the `Samples` that it has for a `[map.NAME]`.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
+from lfd.convert.foreign.mapping import MapEntry, MapRecipe
+from lfd.convert.foreign.message_decoding import decode_message, decoder_of
+from lfd.convert.foreign.message_samples import samples_of_topic
+from lfd.convert.foreign.sampled_frames import frames_of_samples
+from lfd.convert.foreign.samples import Samples
 from lfd.convert.frames import EpisodeFrames
-from lfd.convert.mapping import MapEntry, MapRecipe
-from lfd.convert.message_samples import samples_of_topic
-from lfd.convert.sampled_frames import frames_of_samples
-from lfd.convert.samples import Samples
 from lfd.core.errors import RecordingError
 from lfd.record.mcap_file import SUFFIX, McapContent, Topic, read_mcap
 
@@ -37,6 +39,9 @@ def frames_of_content(content: McapContent, source: str, recipe: MapRecipe) -> l
     if not any(content.messages.values()):
         raise RecordingError(f"{source} holds no messages; leave it out (--skip-bad)")
     _refuse_missing(source, content, recipe)
+    if topic := recipe.resample.task_topic:
+        told = replace(recipe.resample, task=_text_of(content, topic, source), task_topic="")
+        recipe = replace(recipe, resample=told)
 
     def samples_of(entry: MapEntry) -> Samples:
         topic, messages = content.topics[entry.topic], content.messages[entry.topic]
@@ -51,6 +56,19 @@ def frames_of_content(content: McapContent, source: str, recipe: MapRecipe) -> l
         return samples
 
     return frames_of_samples(recipe, source, samples_of)
+
+
+def _text_of(content: McapContent, topic: str, source: str) -> str:
+    """The text of the first message on a topic."""
+    if not content.messages.get(topic):
+        raise RecordingError(f"{source} has no messages on topic {topic}, which [resample] task_topic names")
+    time_ns, data = content.messages[topic][0]
+    where = f"{source}, topic {topic}"
+    message = decode_message(decoder_of(content.topics[topic], where), data, where, time_ns)
+    text = getattr(message, "data", None)
+    if not isinstance(text, str) or not text.strip():
+        raise RecordingError(f"{where} holds no text in its field data; name the task in [resample] task")
+    return text
 
 
 def _refuse_missing(source: str, content: McapContent, recipe: MapRecipe) -> None:

@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import UInt8
 
-from lfd.convert.lerobot_writer import INFO, TASKS
-from lfd.convert.video import decode_video
+from lfd.convert.dataset.lerobot_writer import INFO, TASKS
+from lfd.convert.dataset.video import decode_video
 from lfd.core.artifact import read_manifest
 from lfd.core.errors import DatasetError
 

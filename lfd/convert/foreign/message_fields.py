@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped
 
-from lfd.convert.field_path import Step
-from lfd.convert.mapping import QUATERNION
-from lfd.convert.message_decoding import Decoder
+from lfd.convert.foreign.field_path import Step
+from lfd.convert.foreign.mapping import QUATERNION
+from lfd.convert.foreign.message_decoding import Decoder
 from lfd.core.rotations import wxyz_from_xyzw
 
 SECONDS = ("sec", "seconds", "secs")
