@@ -373,7 +373,7 @@ def _bench_convert(given: Namespace) -> tuple[Result, Result]:
     )
     rows = {"episodes": episodes, "frames": measured["frames"]} | measured["ratios"]
     rows |= {f"frames/s, {name}": rate for name, rate in measured["frames_per_second"].items()}
-    rows |= {f"largest memory at {n} episodes [MB]": size for n, size in measured["memory_mb"].items()}
+    rows |= {f"largest memory at {n} episodes of 200 frames [MB]": x for n, x in measured["memory_mb"].items()}
     return measured, {f"Conversion: {given.task} with {given.robot}": rows}
 
 

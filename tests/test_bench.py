@@ -50,6 +50,33 @@ def test_the_matrix_names_the_cases_that_differ(monkeypatch) -> None:
     assert measured.beyond[0] == "Lift panda OSC_POSE: 1.0e-03, robosuite itself 1.0e-06"
 
 
+@pytest.mark.slow
+def test_the_record_bench_answers_with_its_ratios() -> None:
+    found = call_json(["bench", "record", "--quick"])
+    ours = found["writers"]["ours"]["messages_per_second"]
+    for name in ("mcap", "foxglove-sdk"):
+        ratio = ours / found["writers"][name]["messages_per_second"]
+        assert found["ratios"][f"ours_vs_{name}"] == pytest.approx(ratio, rel=0.01)
+        assert ratio > 1  # the order of the sides, not by how much
+    assert set(found["cost"]) == {"2.5 s", "10 s"}
+    assert found["cost"]["2.5 s"] > found["cost"]["10 s"] > 1  # the beginning of an episode weighs more in a short one
+    assert found["real_time"]["joint states"] == 2000
+    assert found["real_time"]["pictures"] == 120
+
+
+@pytest.mark.slow
+def test_the_convert_bench_answers_with_its_ratios() -> None:
+    found = call_json(["bench", "convert", "--quick"])
+    rates, ratios = found["frames_per_second"], found["ratios"]
+    lerobot = rates.pop("LeRobot's add_frame, save_episode")
+    assert found["frames"] == 1000
+    for name, rate in rates.items():
+        assert ratios[f"{name} vs LeRobot"] == pytest.approx(rate / lerobot, rel=0.02)
+        assert rate > lerobot
+    assert rates["limit: arrays to dataset"] > rates["lfd convert, one process"]
+    assert set(found["memory_mb"]) == {"5", "10"}
+
+
 def test_an_unknown_task_is_an_error() -> None:
     from lfd.core.errors import UnknownName
 

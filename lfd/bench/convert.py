@@ -77,7 +77,6 @@ def bench_convert(
 
         sides: dict[str, Callable[[], Any]] = {
             "lfd convert, one process": lambda: convert([recordings], fresh(), recipe=recipe, jobs=1),
-            f"lfd convert, {cores()} processes": lambda: convert([recordings], fresh(), recipe=recipe, jobs=cores()),
             "limit: arrays to dataset": lambda: _write(frames, fresh()),
             "LeRobot's add_frame, save_episode": lambda: _write_with_lerobot(frames, fresh()),
         }
@@ -85,10 +84,15 @@ def bench_convert(
         for name, run in sides.items():
             rates[name] = round(count / min(_seconds(run) for _ in range(2)), 1)
             bar.advance(note=f"{name}: {rates[name]:.0f} frames/s")
-        memory = {str(n): _memory_of(recordings, n, Path(folder)) for n in dict.fromkeys((episodes, many))}
-        bar.advance()
+        memory = {}
+        memory[str(episodes)], _ = _run(recordings, episodes, Path(folder), 1)
+        bar.advance(note=f"{episodes} episodes: {memory[str(episodes)]:.0f} MB")
+        memory[str(many)], alone = _run(recordings, many, Path(folder), 1)
+        bar.advance(note=f"{many} episodes: {memory[str(many)]:.0f} MB")
+        _, together = _run(recordings, many, Path(folder), cores())
     lerobot = rates["LeRobot's add_frame, save_episode"]
     ratios = {f"{name} vs LeRobot": round(rate / lerobot, 1) for name, rate in rates.items() if rate != lerobot}
+    ratios[f"{cores()} processes vs one, {many} episodes"] = round(alone / together, 2)
     return ConvertBench(episodes=episodes, frames=count, frames_per_second=rates, ratios=ratios, memory_mb=memory)
 
 
@@ -140,15 +144,18 @@ def _write_with_lerobot(frames: Sequence[EpisodeFrames], out: Path) -> None:
     dataset.finalize()
 
 
-def _memory_of(recordings: Path, episodes: int, folder: Path) -> float:
-    """Largest memory [MB] of `lfd convert` for `episodes` episodes, the recordings again and again."""
-    many, recipe = folder / f"many_{episodes}", folder / "recipe.toml"
+def _run(recordings: Path, episodes: int, folder: Path, jobs: int) -> tuple[float, float]:
+    """Largest memory [MB] and wall time [s] of `lfd convert` for `episodes` episodes, the recordings in turn."""
+    name, recipe = f"{episodes}_{jobs}", folder / "recipe.toml"
+    many = folder / f"many_{name}"
     many.mkdir()
     there = sorted(recordings.glob("*.mcap"))
     for index in range(episodes):
         os.link(there[index % len(there)], many / f"episode_{index:06d}.mcap")
     recipe.write_text(f'[convert]\nstate = {list(STATE)}\nenvironment_state = []\naction = "action"\n')
-    arguments = ["convert", many, "--recipe", recipe, "--jobs", 1, "--out", folder / f"dataset_of_{episodes}"]
-    command = [sys.executable, "-c", MEMORY, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return round(float(done.stdout.splitlines()[-1]) / 1024, 1)
+    arguments = ["convert", many, "--recipe", recipe, "--jobs", jobs, "--out", folder / f"dataset_{name}"]
+    began = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", MEMORY, *map(str, arguments)], capture_output=True, text=True, check=True
+    )
+    return round(float(done.stdout.splitlines()[-1]) / 1024, 1), time.perf_counter() - began
