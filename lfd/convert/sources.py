@@ -207,7 +207,7 @@ def frames_of(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
                 f"[map.NAME] tables with --recipe; `lfd info {unit.paths[0]}` lists the topics"
             )
         return frames_of_content(content, str(unit), recipe.mapping())
-    episode = episode_of(content, unit.paths[0])
+    episode = episode_of(content, unit.paths[0], with_states=False)
     convert = recipe.convert()
     if not (convert.failures or episode.success):
         return []

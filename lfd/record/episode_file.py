@@ -6,7 +6,7 @@ episode's start; the action chosen in it at the same time; reward, success and d
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from datetime import UTC, datetime
 from pathlib import Path
@@ -203,8 +203,11 @@ def recipe_in(path: Path) -> dict[str, Any]:
         return {}
 
 
-def episode_of(content: McapContent, path: Path) -> Episode:
-    """The episode in the content of the file `path`; raises what `read_episode` does."""
+def episode_of(content: McapContent, path: Path, *, with_states: bool = True) -> Episode:
+    """The episode in the content of the file `path`, with or without the simulation's states, which are most of it.
+
+    Raises what `read_episode` does.
+    """
     if BEGIN not in content.metadata:
         raise RecordingError(f"{path} is an MCAP file, but no episode of lfd: it has no metadata {BEGIN!r}")
     if END not in content.metadata:
@@ -213,7 +216,7 @@ def episode_of(content: McapContent, path: Path) -> Episode:
     if about.get("format") != FORMAT:
         raise RecordingError(f"{path} has format {about.get('format')!r}, this lfd reads {FORMAT!r}")
     try:
-        return _decode(content, about)
+        return _decode(content, about, with_states)
     except EpisodeError as error:
         raise EpisodeError(f"{path}: {error}; leave the file out") from error
     except RecordingError as error:
@@ -222,7 +225,7 @@ def episode_of(content: McapContent, path: Path) -> Episode:
         raise RecordingError(f"{path} cannot be decoded as an episode ({error}); leave the file out") from error
 
 
-def _decode(content: McapContent, about: dict[str, str]) -> Episode:
+def _decode(content: McapContent, about: dict[str, str], with_states: bool) -> Episode:
     labels = {name: tuple(names) for name, names in json.loads(about["labels"]).items()}
     kinds = {f.name: f.type for f in fields(EpisodeMetadata)}
     metadata: dict[str, Any] = {
@@ -236,13 +239,13 @@ def _decode(content: McapContent, about: dict[str, str]) -> Episode:
     expert = CHANNELS["expert_action"].topic
     return Episode(
         times=(stamps - stamps[0]) / 1e9,
-        observations={name: _observed(content, name, labels[name]) for name in labels if name != "action"},
+        observations=_observed(content, labels),
         actions=arrays(_data(content, "/action"))[1],
         rewards=columns["reward"],
         successes=columns["success"] > 0.5,
         interventions=columns["intervention"] > 0.5,
         expert_actions=arrays(_data(content, expert))[1] if expert in content.messages else None,
-        sim_states=arrays(_data(content, "/sim/state"))[1],
+        sim_states=arrays(_data(content, "/sim/state"))[1] if with_states else None,
         pictures={
             topic.removeprefix(CAMERAS): tuple(cdr.unpack_image(data) for _, data in messages)
             for topic, messages in content.messages.items()
@@ -270,17 +273,30 @@ def _data(content: McapContent, topic: str) -> list[bytes]:
     return [data for _, data in _messages(content, topic)]
 
 
-def _observed(content: McapContent, name: str, labels: tuple[str, ...]) -> np.ndarray:
-    row = channel(name)
-    messages = _data(content, row.topic)
-    if row.schema == POSE:
-        rows = poses(messages)
-        return rows[:, :3] if row.field == "position" else wxyz_from_xyzw(rows[:, 3:])
-    if row.schema == ARRAY:
-        return arrays(messages)[1]
-    assert row.schema == JOINT_STATE
-    names, states = joint_states(messages)
-    return states[:, ("position", "velocity", "effort").index(row.field)][:, [names.index(label) for label in labels]]
+def _observed(content: McapContent, labels: Labels) -> dict[str, np.ndarray]:
+    """The observation's channels; a topic that holds several of them is decoded once."""
+    decoded: dict[str, Any] = {}
+    found = {}
+    for name, components in labels.items():
+        if name == "action":
+            continue
+        row = channel(name)
+        if row.topic not in decoded:
+            decoded[row.topic] = DECODERS[row.schema](_data(content, row.topic))
+        if row.schema == POSE:
+            rows = decoded[row.topic]
+            found[name] = rows[:, :3] if row.field == "position" else wxyz_from_xyzw(rows[:, 3:])
+        elif row.schema == ARRAY:
+            found[name] = decoded[row.topic][1]
+        else:
+            names, states = decoded[row.topic]
+            which = ("position", "velocity", "effort").index(row.field)
+            found[name] = states[:, which][:, [names.index(label) for label in components]]
+    return found
+
+
+DECODERS: Mapping[str, Callable[[list[bytes]], Any]] = {POSE: poses, ARRAY: arrays, JOINT_STATE: joint_states}
+"""Message type to what makes columns of its messages."""
 
 
 def recordings_in(sources: list[Path]) -> list[Path]:

@@ -7,6 +7,7 @@ copying its numbers into a block of bytes, and a whole topic is read by one inde
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -49,15 +50,22 @@ class Layout:
     def read(self, messages: Sequence[bytes]) -> Float[np.ndarray, "N F"] | None:
         """The numbers of messages, or None when one of them has other names or sizes."""
         size = len(self.template)
-        joined = b"".join(messages)
         if set(map(len, messages)) != {size}:
             return None
-        rows = np.frombuffer(joined, np.uint8).reshape(len(messages), size)
-        fixed = np.ones(size, dtype=bool)
-        fixed[self.numbers] = fixed[self.stamps] = False
-        if not (rows[:, fixed] == self.template[fixed]).all():
+        rows = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), size)
+        if any((rows[:, begin:end] != self.template[begin:end]).any() for begin, end in self._fixed):
             return None
-        return np.ascontiguousarray(rows[:, self.numbers]).view("<f8")
+        parts = [rows[:, place : place + end - begin] for place, begin, end in runs_of(self.numbers[::8])]
+        return np.concatenate(parts, axis=1).view("<f8")
+
+    @cached_property
+    def _fixed(self) -> list[tuple[int, int]]:
+        """Begin and end of every run of bytes that are neither numbers nor stamps."""
+        is_fixed = np.ones(len(self.template) + 2, dtype=bool)
+        is_fixed[1:-1][self.numbers] = is_fixed[1:-1][self.stamps] = False
+        is_fixed[[0, -1]] = False
+        edges = np.flatnonzero(np.diff(is_fixed))
+        return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -95,7 +103,7 @@ class StepBlock:
         self._late = np.array([m.late for m in messages], dtype=int)
         self._offsets = np.array(offsets)
         self._bytes = np.concatenate(parts)
-        self._runs = _runs(np.concatenate(numbers)[::8])
+        self._runs = runs_of(np.concatenate(numbers)[::8])
         none = np.empty((0, 8), dtype=int)
         self._stamps = [np.concatenate([none, *places]) for places in stamps]
         self._clocks = [np.concatenate([none, *places]) for places in clocks]
@@ -116,7 +124,7 @@ class StepBlock:
         return Records(block.tobytes(), channels, offsets.reshape(-1), times_ns[:, self._late].reshape(-1))
 
 
-def _runs(places: Int[np.ndarray, "F"]) -> list[tuple[int, int, int]]:
+def runs_of(places: Int[np.ndarray, "F"]) -> list[tuple[int, int, int]]:
     """Runs of numbers that stand side by side: place of the first, and which bytes of all numbers they are."""
     edges = [0, *(np.flatnonzero(np.diff(places) != 8) + 1).tolist(), len(places)]
     return [(int(places[begin]), 8 * begin, 8 * end) for begin, end in pairwise(edges) if begin < end]

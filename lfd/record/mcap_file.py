@@ -258,19 +258,20 @@ class _Reading:
                     continue
                 raise ValueError(f"topic {channel.topic} has messages of two types, {first.schema} and {topic.schema}")
             if self._messages[number]:
-                _note_jump(content, channel.topic, self._messages[number])
                 content.messages.setdefault(channel.topic, []).extend(self._messages[number])
+                _note_jump(content, channel.topic, [time_ns for time_ns, _ in self._messages[number]])
         for messages in content.messages.values():
-            messages.sort(key=lambda message: message[0])
+            times = [time_ns for time_ns, _ in messages]
+            if times != sorted(times):
+                messages.sort(key=lambda message: message[0])
         return content
 
 
-def _note_jump(content: McapContent, topic: str, messages: list[tuple[int, bytes]]) -> None:
+def _note_jump(content: McapContent, topic: str, times_ns: list[int]) -> None:
     """Note where the log times of a channel run back."""
-    for (before, _), (after, _) in pairwise(messages):
-        if after < before:
-            content.jumps.setdefault(topic, (before, after))
-            return
+    if times_ns != sorted(times_ns):
+        jump = next((before, after) for before, after in pairwise(times_ns) if after < before)
+        content.jumps.setdefault(topic, jump)
 
 
 def _stream(content: memoryview) -> ReadDataStream:
