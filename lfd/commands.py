@@ -298,112 +298,15 @@ def run_demo(given: Namespace) -> Result:
 
 def run_bench(given: Namespace) -> Result:
     """Speed, side by side."""
+    from lfd.bench.suites import SUITES
     from lfd.loops.results import write_section
 
-    suites = {"sim": _bench_sim, "cameras": _bench_cameras, "record": _bench_record, "convert": _bench_convert}
-    measured, sections = suites[given.suite](given)
+    measured, sections = SUITES[given.suite](given)
     if given.results is not None:
         command = f"lfd bench {given.suite}" + " --quick" * given.quick + " --full" * given.full
         for title, rows in sections.items():
             write_section(given.results, title, command, rows)
     return measured
-
-
-def _bench_cameras(given: Namespace) -> tuple[Result, Result]:
-    from lfd.bench.cameras import bench_cameras
-    from lfd.terminal import progress_bar
-
-    measured = asdict(
-        bench_cameras(
-            task=given.task,
-            robot=given.robot,
-            control_hz=20,
-            cameras=("agentview", "robot0_eye_in_hand"),
-            sizes=(84, 256),
-            states=10 if given.quick else 40,
-            seed=given.seed,
-            progress=progress_bar,
-        )
-    )
-    rows = measured["ratios"] | {"mean difference [1/255]": measured["mean_difference"]}
-    rows |= {f"frames/s, {name}": rate for name, rate in measured["frames_per_second"].items()}
-    return measured, {f"Cameras: {given.task} with {given.robot}": rows}
-
-
-def _bench_record(given: Namespace) -> tuple[Result, Result]:
-    from lfd.bench.record import bench_record
-    from lfd.terminal import progress_bar
-
-    measured = asdict(
-        bench_record(
-            task=given.task,
-            robot=given.robot,
-            control_hz=20,
-            episodes=5 if given.quick else 30,
-            seconds=2.0 if given.quick else 20.0,
-            seed=given.seed,
-            progress=progress_bar,
-        )
-    )
-    rows = {
-        f"simulation with recording, episodes of {length}": f"{x}x the time" for length, x in measured["cost"].items()
-    }
-    rows |= measured["ratios"]
-    for name, speed in measured["writers"].items():
-        rows[f"writer: {name}"] = ", ".join(f"{value} {key.replace('_', ' ')}" for key, value in speed.items())
-    keep_up = ", ".join(f"{name} {value:g}" for name, value in measured["real_time"].items())
-    rows["1000 Hz joint states and two 256x256 cameras at 30 Hz, in real time"] = keep_up
-    return measured, {f"Recording: {given.task} with {given.robot}": rows}
-
-
-def _bench_convert(given: Namespace) -> tuple[Result, Result]:
-    from lfd.bench.convert import bench_convert
-    from lfd.terminal import progress_bar
-
-    episodes = 5 if given.quick else 50
-    measured = asdict(
-        bench_convert(
-            task=given.task,
-            robot=given.robot,
-            episodes=episodes,
-            many=10 if given.quick else 1000,
-            seed=given.seed,
-            progress=progress_bar,
-        )
-    )
-    rows = {"episodes": episodes, "frames": measured["frames"]} | measured["ratios"]
-    rows |= {f"frames/s, {name}": rate for name, rate in measured["frames_per_second"].items()}
-    rows |= {f"largest memory at {n} episodes of 200 frames [MB]": x for n, x in measured["memory_mb"].items()}
-    return measured, {f"Conversion: {given.task} with {given.robot}": rows}
-
-
-def _bench_sim(given: Namespace) -> tuple[Result, Result]:
-    from lfd.bench.matrix import bench_matrix, success_rates, whole_matrix
-    from lfd.bench.sim import bench_everywhere, bench_sim
-    from lfd.terminal import progress_bar
-
-    common: dict[str, Any] = {"control_hz": 20, "seed": given.seed, "progress": progress_bar}
-    episodes = 2 if given.quick else 20
-    measured = asdict(bench_sim(task=given.task, robot=given.robot, episodes=episodes, **common))
-    sections = {
-        f"Simulation: {given.task} with {given.robot}": measured["ratios"]
-        | {f"steps/s, {name}": rate for name, rate in measured["steps_per_second"].items()}
-    }
-    if given.full:
-        measured["everywhere"] = bench_everywhere(**common)
-        measured["matrix"] = asdict(bench_matrix(whole_matrix(), steps=10, **common))
-        rates = success_rates(task="Lift", robot="panda", episodes=100, **common)
-        measured["success"] = rates
-        said = {
-            name: f"{won} of 100, 95% interval {low:.1%} to {high:.1%}" for name, (won, (low, high)) in rates.items()
-        }
-        sections["Simulation: success of a noisy expert on both steppers"] = said
-        sections["Simulation: every task with a Panda, every robot on Lift"] = {
-            pair: ", ".join(f"{name} {value}" for name, value in ratios.items())
-            for pair, ratios in measured["everywhere"].items()
-        }
-        sections["Simulation: same numbers as robosuite, every robot x controller x task"] = measured["matrix"]
-    return measured, sections
 
 
 @contextmanager
