@@ -18,7 +18,7 @@ from lfd.core.artifact import versions
 from lfd.core.channels import ARRAY, CHANNELS, IMAGE, JOINT_STATE, POSE, channel
 from lfd.core.episode import Episode, EpisodeMetadata
 from lfd.core.errors import EpisodeError, RecordingError
-from lfd.core.protocols import Observation, Transition, World, WorldState
+from lfd.core.protocols import Observation, Transition, World, WorldSpec, WorldState
 from lfd.core.rotations import wxyz_from_xyzw
 from lfd.record import cdr
 from lfd.record.columns import arrays, joint_states, poses
@@ -56,28 +56,12 @@ class McapRecorder:
         self._path, self._origin, self._keep_failures = path, origin, keep_failures
 
     def begin(self, world: World, observation: Observation) -> None:
-        spec, origin = world.spec, self._origin
+        spec, origin, state = world.spec, self._origin, world.get_state()
         self._writer = McapWriter(self._path)
         self._labels, self._hz = spec.labels, spec.control_hz
         self._topics = {name: channel(f"{name}_picture").topic for name in spec.cameras}
         self._steps, self._reward, self._failure = 0, 0.0, ""
         self._start_ns = time.time_ns()
-        about = EpisodeMetadata(
-            task=spec.task,
-            instruction=spec.instruction,
-            robot=spec.robot,
-            controller=spec.controller,
-            policy=origin.policy,
-            control_hz=spec.control_hz,
-            stage=origin.stage,
-            seed=origin.seed,
-            index=origin.index,
-            stepper=spec.stepper,
-            started=datetime.fromtimestamp(self._start_ns / 1e9, UTC).isoformat(),
-            versions=versions(),
-            recipe=origin.recipe,
-        )
-        state = world.get_state()
         self._observed = [name for name in self._labels if name != "action"]
         self._key, self._sim_size = tuple(self._labels.items()), len(state.sim)
         self._journal: Journal | None = None
@@ -91,7 +75,7 @@ class McapRecorder:
             self._writer.channel(topic, IMAGE, {"unit": "1/255", "frame": name})
         self._writer.channel("/task", "std_msgs/msg/String", {})
         self._writer.channel("/events", "rcl_interfaces/msg/Log", {})
-        write_about(self._writer, about, self._labels, state, self._start_ns)
+        write_about(self._writer, self._about(spec), self._labels, state, self._start_ns)
         self._writer.message("/task", self._start_ns, cdr.pack_string(spec.instruction))
         self._event(self._start_ns, "episode_begin", policy=origin.policy, seed=origin.seed, index=origin.index)
         numbers = np.concatenate([*(observation[name] for name in self._observed), state.sim])
@@ -140,6 +124,24 @@ class McapRecorder:
             if self._journal is not None:
                 self._journal.remove()
                 self._journal = None
+
+    def _about(self, spec: WorldSpec) -> EpisodeMetadata:
+        origin = self._origin
+        return EpisodeMetadata(
+            task=spec.task,
+            instruction=spec.instruction,
+            robot=spec.robot,
+            controller=spec.controller,
+            policy=origin.policy,
+            control_hz=spec.control_hz,
+            stage=origin.stage,
+            seed=origin.seed,
+            index=origin.index,
+            stepper=spec.stepper,
+            started=datetime.fromtimestamp(self._start_ns / 1e9, UTC).isoformat(),
+            versions=versions(),
+            recipe=origin.recipe,
+        )
 
     def _begin_journal(self, kind: tuple[bool, Components]) -> None:
         """Have a journal for steps with or without an expert's action, and with some signals."""
