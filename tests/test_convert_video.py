@@ -238,3 +238,11 @@ def test_encoders_say_nothing() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
+
+
+@pytest.mark.parametrize("codec", ["h264", "hevc", "libsvtav1"])
+def test_the_same_pictures_make_the_same_bytes(codec) -> None:
+    noise = np.random.default_rng(0)
+    pictures = [np.clip(noise.normal(128 + 4 * t, 20, (64, 96, 3)), 0, 255).astype(np.uint8) for t in range(30)]
+    made = {encode_video(pictures, 20, VideoRecipe(codec=codec), "a") for _ in range(60 if codec == "h264" else 5)}
+    assert len(made) == 1

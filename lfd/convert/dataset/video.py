@@ -45,8 +45,9 @@ class VideoRecipe:
         common = {"g": str(self.gop), "crf": str(self.crf)}
         if self.codec == "libsvtav1":
             return common | {"preset": str(self.preset), "svtav1-params": "fast-decode=0:lp=1"}
-        quiet = {"x265-params": "log-level=error:pools=none"} if self.codec == "hevc" else {}
-        return common | quiet | {"threads": "1"}  # episodes are encoded in parallel
+        # with x264's mbtree the same small pictures make other bytes now and then
+        own = {"h264": {"x264-params": "mbtree=0"}, "hevc": {"x265-params": "log-level=error:pools=none"}}
+        return common | own[self.codec] | {"threads": "1"}  # episodes are encoded in parallel
 
 
 def encode_video(pictures: Iterable[UInt8[np.ndarray, "H W 3"]], fps: int, recipe: VideoRecipe, where: str) -> bytes:
