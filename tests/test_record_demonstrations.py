@@ -26,7 +26,7 @@ def short() -> RecordRecipe:
 
 
 def test_what_is_recorded_does_not_depend_on_the_number_of_worlds(short, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(robosuite_world, "_cores", lambda: 3)
+    monkeypatch.setattr(robosuite_world, "cores", lambda: 3)
     recorded = []
     for most in (1, 3):
         out = tmp_path / str(most)

@@ -45,7 +45,7 @@ def test_the_result_does_not_depend_on_the_number_of_worlds(thread, tmp_path, mo
     from lfd.run.evaluate import EvalRecipe
     from lfd.worlds import robosuite_world
 
-    monkeypatch.setattr(robosuite_world, "_cores", lambda: 3)
+    monkeypatch.setattr(robosuite_world, "cores", lambda: 3)
     recipe = EvalRecipe(episodes=4, seed=1, max_seconds=1.0, hold_seconds=0.5)
     reports, states = [], []
     for most in (1, 3):

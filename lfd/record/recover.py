@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool
 
-from lfd.core.channels import ARRAY, CHANNELS, IMAGE, channel
+from lfd.core.channels import CHANNELS, IMAGE, channel
 from lfd.core.errors import EpisodeError, RecordingError
 from lfd.core.protocols import Progress, silent
 from lfd.record.columns import arrays
@@ -213,7 +213,7 @@ def _write(path: Path, content: McapContent, steps: _Steps, begin: int, end: int
 def _kept(content: McapContent, steps: _Steps, begin: int, end: int) -> list[tuple[int, str, bytes]]:
     """The messages of some steps in the order of time: observations to `end`, what was decided to the step before."""
     late = {CHANNELS["reward"].topic}
-    early = {t for t, told in content.topics.items() if told.schema == ARRAY and _is_decided(t)}
+    early = {"/gripper/command", *(CHANNELS[n].topic for n in ("action", "expert_action", "teleop_axes", "pace"))}
     kept = []
     for topic, messages in content.messages.items():
         for stamp, data in messages:
@@ -222,10 +222,3 @@ def _kept(content: McapContent, steps: _Steps, begin: int, end: int) -> list[tup
             if first <= at <= last:
                 kept.append((stamp, topic, data))
     return sorted(kept, key=lambda message: message[0])
-
-
-def _is_decided(topic: str) -> bool:
-    return topic in {
-        "/gripper/command",
-        *(CHANNELS[n].topic for n in ("action", "expert_action", "teleop_axes", "pace")),
-    }

@@ -7,7 +7,6 @@ compiled where it can be (`lfd.worlds.steppers`).
 """
 
 import logging
-import os
 import random
 import threading
 import xml.etree.ElementTree as ET
@@ -21,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lfd.core.errors import InputError, SimulationError
+from lfd.core.processes import cores
 from lfd.core.protocols import Observation, Progress, StepResult, WorldSpec, WorldState, silent
 from lfd.worlds.cameras import Cameras
 from lfd.worlds.drawn_sizes import draw_sizes
@@ -380,7 +380,7 @@ def make_worlds(
     task: str, robot: str, control_hz: int, *, most: int, progress: Progress = silent
 ) -> list[RobosuiteWorld]:
     """A world for each core of this machine, `most` at the most."""
-    count = max(1, min(most, _cores()))
+    count = max(1, min(most, cores()))
     worlds = []
     with progress(f"build {count} {'world' if count == 1 else 'worlds'}", count) as bar:
         for _ in range(count):  # the first time on a machine, the control step is compiled
@@ -393,8 +393,3 @@ def make_worlds(
 def kept_world(task: str, robot_name: str, robot: RobotConfig, control_hz: int) -> RobosuiteWorld:
     """The world of a worker that takes one unit of work after another: built once."""
     return RobosuiteWorld(task=load_task(task), robot_name=robot_name, robot=robot, control_hz=control_hz)
-
-
-def _cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
