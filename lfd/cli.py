@@ -52,6 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "record": "finished episodes are kept",
             "demo": "finished stages are kept",
             "sweep": "finished policies are kept",
+            "recover": "what was recovered so far is kept",
         }
         print(
             f"\nlfd {arguments.name}: interrupted; {kept.get(arguments.name, 'nothing was written')}", file=sys.stderr

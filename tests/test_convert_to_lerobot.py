@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -296,3 +297,19 @@ def test_a_process_that_dies_is_said() -> None:
 
     with pytest.raises(LfdError, match="a worker process died, for example for lack of memory; try it with --jobs 1"):
         list(ProcessMap(2)(die, None, [1, 2, 3]))
+
+
+def test_a_folder_of_both_kinds_gives_both_and_missing_files_a_sentence(thread, lfd_fails, tmp_path) -> None:
+    from lfd.convert.sources import SourceRecipe, units_of
+
+    both = tmp_path / "both"
+    shutil.copytree(thread.recordings, both)
+    (both / "damaged.hdf5").write_bytes(b"no HDF5")
+    units = units_of([both], SourceRecipe(where="test"))
+    assert [unit.paths[0].name for unit in units] == ["damaged.hdf5", "episode_000000.mcap", "episode_000001.mcap"]
+    for command in (("convert",), ("export", "--to", "mcap")):
+        assert "no recording" in lfd_fails(*command, tmp_path / "nope.hdf5", "--out", tmp_path / "out")
+        assert "damaged.hdf5" in lfd_fails(*command, both, "--out", tmp_path / "out")
+    convert([both], tmp_path / "rest", skip_bad=True)
+    assert verify(tmp_path / "rest", [both]) > 0
+    assert not (tmp_path / "out").exists()

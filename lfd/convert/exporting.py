@@ -11,7 +11,7 @@ from lfd.convert.dataset.lerobot_writer import INFO, OWN
 from lfd.convert.frames import EpisodeFrames
 from lfd.convert.hdf5.robomimic_export import export_episodes, export_frames
 from lfd.convert.mcap_export import export_mcap
-from lfd.convert.sources import SourceRecipe, Unit, episode_in, hashes, units_of
+from lfd.convert.sources import HDF5, SourceRecipe, Unit, episode_in, hashes, units_of
 from lfd.core.artifact import new_folder, write_manifest
 from lfd.core.errors import InputError
 from lfd.core.protocols import Progress, silent
@@ -105,7 +105,7 @@ def _export_recordings(
     units: Sequence[Unit], recipe: SourceRecipe, out: Path, overwrite: bool, progress: Progress
 ) -> Exported:
     """Write HDF5 demonstrations, which the simulator fills, as recordings."""
-    if not any(unit.demo for unit in units):
+    if not any(unit.paths[0].suffix in HDF5 for unit in units):
         raise InputError("recordings are MCAP files already; export them with --to robomimic")
     with new_folder(out, overwrite=overwrite) as part, progress("export", len(units)) as bar:
         for index, unit in enumerate(units):

@@ -20,6 +20,7 @@ from lfd.core.episode import Episode
 from lfd.core.errors import RecipeError, RecordingError
 from lfd.core.recipe import Table, build, load_toml
 from lfd.record.episode_file import BEGIN, episode_of, recipe_in
+from lfd.record.mcap_file import SUFFIX
 
 TABLES = ("record", "convert", "resample", "map", "video")
 HDF5 = (".hdf5", ".h5")
@@ -72,7 +73,7 @@ class SourceRecipe:
         if "convert" in self.tables or self.is_mapping:
             return self
         for unit in units:
-            kept = {} if unit.demo else recipe_in(unit.paths[0])
+            kept = {} if unit.paths[0].suffix in HDF5 else recipe_in(unit.paths[0])
             if "convert" in kept:
                 return replace(self, tables={**{name: kept[name] for name in TABLES if name in kept}, **self.tables})
         return self
@@ -165,14 +166,13 @@ def units_of(sources: Sequence[Path], recipe: SourceRecipe) -> list[Unit]:
 
 
 def _units_in(source: Path, recipe: SourceRecipe) -> Iterator[Unit]:
-    files = sorted(path for path in source.rglob("*") if path.suffix in HDF5) if source.is_dir() else []
-    if source.suffix in HDF5:
-        files = [source]
+    if not source.exists():
+        raise RecordingError(f"no recording {source}; `lfd record RECIPE --out {source}` makes some")
+    inside = sorted(source.rglob("*")) if source.is_dir() else [source]
+    files = [path for path in inside if path.suffix in HDF5]
     for file in files:
         yield from _demos_in(file, recipe)
-    if not files:
-        if not source.exists():
-            raise RecordingError(f"no recording {source}; `lfd record RECIPE --out {source}` makes some")
+    if not files or any(path.suffix == SUFFIX for path in inside):
         yield from (Unit(bag) for bag in bags_in([source]))
 
 
@@ -237,7 +237,7 @@ def _replayed(unit: Unit, recipe: SourceRecipe) -> Any:
 
 def episode_in(unit: Unit, recipe: SourceRecipe) -> Episode:
     """The episode of a recording of lfd, or of a demonstration, which the simulator fills."""
-    if unit.demo:
+    if unit.paths[0].suffix in HDF5:
         return _replayed(unit, recipe).episode
     return episode_of(joined(unit.paths), unit.paths[0])
 

@@ -1,7 +1,7 @@
 """A chunk of an MCAP file: message records, compressed, with their index.
 
-Chunks are written several times a second of an episode, so their records are put together here by hand: the library's
-builder takes ten times as long.
+Chunks are written again and again while an episode runs, so their records are put together here by hand and not by the
+library, which writes number by number.
 """
 
 import struct

@@ -1,12 +1,12 @@
-"""Writes MCAP files so that a crash loses half a second at the most, and so that writing hardly costs time.
+"""Writes MCAP files that are whole or named `.part`, and takes the messages of many steps at once.
 
 A file is written under a `.part` name and renamed when it is closed: a finished name always means a whole file.
 Messages are collected into chunks, each compressed, with a checksum and an index; a chunk goes to the operating
-system before the messages in it span more than `FLUSH_NS`, which is what a killed process loses. `lfd recover`
-turns the chunks of a `.part` file into an episode.
+system before the messages in it span more than `FLUSH_NS`, which a killed process loses of what was handed over here.
+(The recorder loses less: `lfd.record.journal`.) `lfd recover` turns the chunks of a `.part` file into an episode.
 
-The library's own writer takes messages one by one, which costs a third of a simulated control step. Here the messages
-of a step can be handed over as one block of bytes (`lfd.record.step_block`).
+The library's own writer takes messages one by one; here the messages of steps can be handed over as one block of bytes
+(`lfd.record.layouts`).
 """
 
 import os
