@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from lfd.core.protocols import Decision
-from lfd.experts.lift import LiftExpert, turn_downwards
+from lfd.experts.lift import LiftExpert
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.registry import make_expert
 from lfd.run.wilson import wilson_interval
@@ -47,15 +47,6 @@ def test_the_same_observation_gives_the_same_action(lift_world) -> None:
     for _ in range(5):
         lift_world.step(first.act(seen).action)
     np.testing.assert_array_equal(first.act(seen).action, second.act(seen).action)
-
-
-def test_turning_downwards_ends_pointing_down() -> None:
-    from scipy.spatial.transform import Rotation
-
-    for seed in range(20):
-        start = Rotation.from_euler("xyz", [np.pi, 0, 0]) * Rotation.random(rng=np.random.default_rng(seed)) ** 0.4
-        turned = Rotation.from_rotvec(turn_downwards(start.as_quat(scalar_first=True))) * start
-        np.testing.assert_allclose(turned.as_matrix()[:, 2], [0, 0, -1], atol=1e-6)
 
 
 def test_noise_is_applied_and_the_label_stays_clean(lift_world) -> None:

@@ -15,17 +15,21 @@ eighth of a turn, which an imitator learns badly from few demonstrations.
 
 import numpy as np
 
-from lfd.core.errors import InputError
 from lfd.core.protocols import Decision, Observation, WorldSpec
-from lfd.core.rotations import matrix_from_wxyz, rotvec_between
+from lfd.experts.reaching import (
+    CLOSE,
+    OPEN,
+    Hand,
+    above,
+    check_controller,
+    funnel,
+    nearest_yaw,
+    pointing_down,
+    towards,
+    yaw_of,
+)
+from lfd.experts.style import PLAIN, ExpertStyle
 
-STEP_M = 0.05
-"""Change of the goal position at full action [m]."""
-STEP_RAD = 0.5
-"""Change of the goal orientation at full action [rad]."""
-POSITION_GAIN = 2.0
-"""Action, as a multiple of the remaining way in units of STEP_M."""
-ROTATION_GAIN = 1.0
 HOVER_M = 0.06
 """Height above the cube at which the gripper is brought over it [m]."""
 FUNNEL_M = (0.008, 0.030)
@@ -38,9 +42,7 @@ HELD_WIDTH_M = (0.030, 0.066)
 """Opening of the fingers when they hold the cube: 0.040 m by its sides to 0.063 m by its edges [m]."""
 STOPPED_M_S = 0.02
 """Speed of each finger below which it has stopped [m/s]; closing freely they move at 0.07 m/s."""
-
-OPEN, CLOSE = -1.0, 1.0
-DOWN = np.array([0.0, 0.0, -1.0])
+QUARTER = np.pi / 2
 
 
 class LiftExpert:
@@ -51,16 +53,17 @@ class LiftExpert:
 
     name = "lift_expert"
 
-    def __init__(self, spec: WorldSpec):
-        if spec.controller != "OSC_POSE":
-            raise InputError(f"the Lift expert drives OSC_POSE, robot {spec.robot!r} has {spec.controller}")
+    def __init__(self, spec: WorldSpec, style: ExpertStyle = PLAIN):
+        check_controller(spec, "Lift")
+        self._style, self._speed = style, style.speed[1]
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Nothing to forget: the expert has no memory and no randomness."""
+        """Draw the speed of the episode; beside it the expert has no memory."""
+        self._speed = self._style.draw_speed(rng)
 
     def act(self, observation: Observation) -> Decision:
-        ee, cube = observation["ee_pos"], observation["cube_pos"]
-        away = ee - cube
+        hand, cube = Hand.of(observation), observation["cube_pos"]
+        away = hand.position - cube
         sideways = float(np.hypot(away[0], away[1]))
         width = float(np.ptp(observation["gripper_pos"]))
         stopped = float(np.abs(observation["gripper_vel"]).max()) < STOPPED_M_S
@@ -70,18 +73,7 @@ class LiftExpert:
         elif around:
             target, gripper = cube, CLOSE
         else:
-            off = (sideways - FUNNEL_M[0]) / (FUNNEL_M[1] - FUNNEL_M[0])
-            target, gripper = cube - HOVER_M * min(max(off, 0.0), 1.0) * DOWN, OPEN
-        move = POSITION_GAIN * (target - ee) / STEP_M
-        turn = ROTATION_GAIN * turn_downwards(observation["ee_quat"]) / STEP_RAD
-        action = np.clip(np.concatenate([move, turn, [gripper]]), -1.0, 1.0)
+            target, gripper = above(cube, HOVER_M * funnel(sideways, *FUNNEL_M)), OPEN
+        rotation = pointing_down(nearest_yaw(yaw_of(hand.rotation), 0.0, QUARTER))
+        action = towards(hand, target, rotation, gripper, speed=self._speed)
         return Decision(action, expert_action=action)
-
-
-def turn_downwards(ee_quat: np.ndarray) -> np.ndarray:
-    """Rotation vector [rad], world frame, to the nearest pose that points down along the axes of the world."""
-    gripper = matrix_from_wxyz(ee_quat)
-    quarter = np.pi / 2
-    yaw = quarter * np.round(np.arctan2(gripper[1, 0], gripper[0, 0]) / quarter)
-    x_axis = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    return rotvec_between(gripper, np.column_stack([x_axis, np.cross(DOWN, x_axis), DOWN]))

@@ -8,8 +8,9 @@ from lfd.core.errors import InputError, UnknownName
 from lfd.core.protocols import Policy, WorldSpec
 from lfd.experts.device import Device, WithKeyboard
 from lfd.experts.lift import LiftExpert
+from lfd.experts.style import PLAIN, ExpertStyle
 
-EXPERTS: dict[str, Callable[[WorldSpec], Policy]] = {
+EXPERTS: dict[str, Callable[[WorldSpec, ExpertStyle], Policy]] = {
     "Lift": LiftExpert,
 }
 
@@ -20,13 +21,13 @@ def check_expert(task: str) -> None:
         raise UnknownName("task of a scripted expert", task, EXPERTS)
 
 
-def make_expert(spec: WorldSpec) -> Policy:
+def make_expert(spec: WorldSpec, style: ExpertStyle = PLAIN) -> Policy:
     """The expert for a world's task.
 
     Raises `UnknownName` for a task that has none.
     """
     check_expert(spec.task)
-    return EXPERTS[spec.task](spec)
+    return EXPERTS[spec.task](spec, style)
 
 
 def _keyboard() -> AbstractContextManager[Device]:

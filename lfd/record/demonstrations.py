@@ -14,6 +14,7 @@ from lfd.core.protocols import Policy, Progress, UnitMap, World, batches, silent
 from lfd.core.recipe import as_table
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.registry import check_expert, make_expert
+from lfd.experts.style import ExpertStyle
 from lfd.record.episode_file import McapRecorder, Origin
 from lfd.record.journal import SUFFIX as JOURNAL
 from lfd.record.mcap_file import SUFFIX
@@ -49,6 +50,10 @@ class RecordRecipe:
     """Simulated time for which the task must stay solved [s]."""
     action_noise: float
     """Standard deviation of the noise on the expert's actions, in units of the action."""
+    expert_speed: tuple[float, ...] = (1.0, 1.0)
+    """Lowest and highest speed of the scripted expert, as a fraction of the full action; drawn for each episode."""
+    expert_approach: str = "nearest"
+    """From which side the scripted expert grasps: nearest, or any (drawn for each episode)."""
     cameras: tuple[str, ...] = ()
     """Cameras of the model whose pictures are recorded, for example agentview and robot0_eye_in_hand."""
     camera_height: int = 128
@@ -67,6 +72,13 @@ class RecordRecipe:
         for key in ("seed", "action_noise"):
             if getattr(self, key) < 0:
                 raise RecipeError(f"{where} {key} = {getattr(self, key)}: must not be negative")
+
+        self.style.check(where)
+
+    @property
+    def style(self) -> ExpertStyle:
+        """How the scripted expert goes about the task."""
+        return ExpertStyle(speed=self.expert_speed, approach=self.expert_approach)
 
     @property
     def horizon(self) -> int:
@@ -275,5 +287,5 @@ def take_cameras(world: RobosuiteWorld, recipe: RecordRecipe) -> None:
 
 
 def _demonstrator(world: World, recipe: RecordRecipe) -> Policy:
-    expert = make_expert(world.spec)
+    expert = make_expert(world.spec, recipe.style)
     return NoisyPolicy(expert, scale=recipe.action_noise) if recipe.action_noise > 0 else expert
