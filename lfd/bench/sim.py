@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from lfd.core.protocols import Progress, silent
-from lfd.experts.registry import EXPERTS
+from lfd.experts.registry import EXPERTS, make_expert
 from lfd.worlds.environments import make_environment
 from lfd.worlds.robosuite_world import INTEGRATION, RobosuiteWorld, make_world
 from lfd.worlds.robots import load_robot, robot_names
@@ -106,8 +106,10 @@ def bench_everywhere(*, control_hz: int, seed: int, progress: Progress = silent)
 def _take_episode(world: RobosuiteWorld, stock: dict[str, Any], costs: "_Costs", rng: np.random.Generator) -> None:
     """Two seconds on every side, from the same start with the same actions, in turns of a few steps."""
     spec = world.spec
-    expert = EXPERTS[spec.task](spec) if spec.task in EXPERTS and spec.robot == "panda" else None
+    expert = make_expert(spec) if spec.task in EXPERTS and spec.robot == "panda" else None
     seen, start = world.reset(rng), world.get_state()
+    if expert:
+        expert.reset(rng)
     for env in stock.values():
         env.reset_from_xml_string(start.model_xml)
         _put(env.sim.model._model, env.sim.data._data, start.sim)
