@@ -72,3 +72,32 @@ def test_folders_that_are_no_dataset(copy, tmp_path) -> None:
     info.write_text(info.read_text().replace('"v3.0"', '"v2.1"'))
     with pytest.raises(DatasetError, match=r"version v2.1, expected v3.0"):
         load_frames(copy)
+
+
+def test_units_and_interventions_of_our_converter(thread) -> None:
+    frames = load_frames(thread.dataset)
+    assert frames.units.keys() == frames.names.keys() == frames.columns.keys()
+    assert frames.units["observation.state"][:1] == ("rad",)
+    assert frames.intervention is not None
+    assert frames.intervention.shape == (len(frames),)
+    assert not frames.intervention.any()
+    first, end = frames.episodes
+    assert first.tolist() == [0, int(end[0])]
+    assert int(end[1]) == len(frames)
+
+
+def test_a_vector_of_two_axes_is_refused(copy) -> None:
+    info = copy / "meta" / "info.json"
+    told = json.loads(info.read_text())
+    told["features"]["action"]["shape"] = [7, 1]
+    info.write_text(json.dumps(told))
+    with pytest.raises(DatasetError, match=r"action has the shape \(7, 1\), expected one vector for each frame"):
+        load_frames(copy)
+
+
+def test_episodes_in_disorder_are_refused(copy) -> None:
+    file = next((copy / "data").rglob("*.parquet"))
+    table = pq.read_table(file)
+    pq.write_table(table.take(list(range(len(table)))[::-1]), file)
+    with pytest.raises(DatasetError, match="does not have its episodes one after the other"):
+        load_frames(copy)
