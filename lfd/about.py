@@ -1,5 +1,6 @@
 """What a path is: a recording, a folder of them, a dataset, a policy, an evaluation, or a recipe."""
 
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +56,11 @@ def _about_recipe(path: Path) -> dict[str, Any]:
     """Every key that the recipe's tables know, with its value and its meaning."""
     from lfd.convert.features import ConvertRecipe
     from lfd.convert.foreign.mapping import ResampleRecipe, map_recipe
-    from lfd.policies.registry import recipe_class
+    from lfd.loops.dagger_recipe import DaggerRecipe
+    from lfd.policies.registry import make_config
     from lfd.record.demonstrations import RecordRecipe
-    from lfd.run.evaluate import EvalRecipe
-    from lfd.train.behavior_cloning import TrainRecipe
+    from lfd.run.trial import EvalRecipe
+    from lfd.train.recipe import TrainRecipe
     from lfd.worlds.robots import RobotConfig, TeleopConfig
 
     kinds: dict[str, type] = {
@@ -69,6 +71,7 @@ def _about_recipe(path: Path) -> dict[str, Any]:
         "resample": ResampleRecipe,
         "train": TrainRecipe,
         "eval": EvalRecipe,
+        "dagger": DaggerRecipe,
     }
     facts: dict[str, Any] = {"kind": "recipe"}
     tables = load_toml(path, (*kinds, "policy", "map"))
@@ -77,14 +80,28 @@ def _about_recipe(path: Path) -> dict[str, Any]:
             for channel, entry in map_recipe(tables, str(path)).entries.items():
                 facts |= _about_keys(f"map.{channel}", entry)
             continue
-        kind = kinds[name] if name != "policy" else recipe_class(table, f"{path} [policy]")
-        facts |= _about_keys(name, build(kind, table, f"{path} [{name}]"))
+        if name == "policy":
+            facts |= _about_policy_keys(make_config(table, f"{path} [policy]"))
+        else:
+            facts |= _about_keys(name, build(kinds[name], table, f"{path} [{name}]"))
     return facts
 
 
 def _about_keys(name: str, values: Any) -> dict[str, Any]:
     meanings = describe(type(values))
     return {f"{name}.{key}": {"value": v, "meaning": meanings[key]} for key, v in as_table(values).items()}
+
+
+def _about_policy_keys(config: Any) -> dict[str, Any]:
+    """The fields of a LeRobot configuration; the meaning of LeRobot's own ones is in its documentation."""
+    meanings: dict[str, str] = {}
+    for kind in reversed(type(config).__mro__[:-1]):
+        if is_dataclass(kind):
+            meanings |= describe(kind)
+    plain = {field.name: getattr(config, field.name) for field in fields(config)}
+    shown = {key: value for key, value in plain.items() if isinstance(value, (bool, int, float, str, list, tuple))}
+    facts = {f"policy.{key}": {"value": value, "meaning": meanings.get(key, "")} for key, value in shown.items()}
+    return {"policy.type": config.type, **facts}
 
 
 def _about_recording(path: Path) -> dict[str, Any]:

@@ -200,7 +200,7 @@ def test_an_evaluation_that_loses_a_node_is_the_same_episode_for_episode(two_nod
     from contextlib import nullcontext
 
     from lfd import evaluate, read_episode
-    from lfd.run.evaluate import EvalRecipe
+    from lfd.run.trial import EvalRecipe
 
     # barely trained, it fails: three episodes to a unit, which takes about a second, and two units wait for a core
     recipe = EvalRecipe(episodes=24, seed=5, max_seconds=20.0, hold_seconds=0.5)

@@ -43,7 +43,7 @@ def test_the_loss_is_the_mean_square_over_components(thread) -> None:
     batch = before(dict(frames.columns))
     with torch.no_grad():
         loss, _ = policy.forward(batch)
-        away = policy.predict(batch) - batch["action"]
+        away = policy.raw(batch)[:, 0, 0] - batch["action"]
     assert float(loss) == pytest.approx(float((away.norm(dim=1) ** 2 / away.shape[1]).mean()), rel=1e-6)
 
 
@@ -67,7 +67,7 @@ def test_folders_that_are_no_policy(thread, lift_world, tmp_path) -> None:
 
     with pytest.raises(PolicyError, match="no policy folder"):
         LearnedPolicy(tmp_path / "nothing", lift_world.spec)
-    with pytest.raises(PolicyError, match="manifest.json is missing or of another kind"):
+    with pytest.raises(PolicyError, match="is a dataset, no policy; `lfd train RECIPE"):
         LearnedPolicy(thread.dataset, lift_world.spec)
     copy = shutil.copytree(thread.policy, tmp_path / "policy")
     (copy / "model.safetensors").write_bytes(b"\x80\x04garbage that could be a pickle")

@@ -42,7 +42,7 @@ def test_decisions_of_a_policy_are_recorded_as_its_actions(thread, lift_world) -
 
 def test_the_result_does_not_depend_on_the_number_of_worlds(thread, tmp_path, monkeypatch) -> None:
     from lfd import evaluate
-    from lfd.run.evaluate import EvalRecipe
+    from lfd.run.trial import EvalRecipe
     from lfd.worlds import robosuite_world
 
     monkeypatch.setattr(robosuite_world, "cores", lambda: 3)

@@ -105,5 +105,49 @@ def _sim(given: Namespace) -> tuple[Measured, Measured]:
     return measured, sections
 
 
-SUITES: dict[str, Suite] = {"sim": _sim, "cameras": _cameras, "record": _record, "convert": _convert}
+def _train(given: Namespace) -> tuple[Measured, Measured]:
+    from lfd.bench.train import bench_train
+
+    measured = asdict(
+        bench_train(
+            episodes=10 if given.quick else 50,
+            turns=3 if given.quick else 9,
+            seconds=0.2 if given.quick else 1.0,
+            peers=not given.quick,
+            workers=not given.quick,
+            seed=given.seed,
+            progress=progress_bar,
+        )
+    )
+    loading: Measured = {"frames in the dataset, episodes of 200": measured["frames"]}
+    for kind, ratios in measured["loading_ratios"].items():
+        loading |= {f"{kind}: lfd {name}": f"{ratio:g}x" for name, ratio in ratios.items()}
+        loading |= {f"{kind}: frames/s, {name}": x for name, x in measured["frames_per_second"][kind].items()}
+    steps: Measured = {"robomimic and imitation": f"left out: {measured['missing']}"} if measured["missing"] else {}
+    for kind, ratios in measured["step_ratios"].items():
+        steps |= {f"{kind}: lfd {name}": f"{ratio:g}x" for name, ratio in ratios.items()}
+        steps |= {f"{kind}: gradient steps/s, {name}": x for name, x in measured["steps_per_second"][kind].items()}
+    return measured, {"Training: loading in batches of 64": loading, "Training: behaviour cloning": steps}
+
+
+def _dagger(given: Namespace) -> tuple[Measured, Measured]:
+    from pathlib import Path
+
+    from lfd.bench.dagger import bench_dagger, plot, rows_of, setting_of
+
+    seeds = (given.seed,) if given.quick else tuple(range(given.seed, given.seed + 5))
+    measured = bench_dagger(setting_of(given.task, quick=given.quick), seeds=seeds, progress=progress_bar)
+    if given.results is not None:
+        plot(measured, Path("docs/pictures/dagger_labels.png"))
+    return asdict(measured), {f"DAgger: {given.task} by labels": rows_of(measured)}
+
+
+SUITES: dict[str, Suite] = {
+    "sim": _sim,
+    "cameras": _cameras,
+    "record": _record,
+    "convert": _convert,
+    "train": _train,
+    "dagger": _dagger,
+}
 """Name to suite."""

@@ -5,7 +5,7 @@ Any key that starts with `action` becomes an output of a LeRobot policy and any 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,31 @@ def frames_of_episode(
         return _frames(episode, recipe, source, notes or {})
     except UnknownName as error:
         raise DatasetError(f"{source}: {error}") from error
+
+
+def pieces_of_episode(
+    episode: Episode, recipe: ConvertRecipe, source: str, *, notes: Mapping[str, Any] | None = None
+) -> list[EpisodeFrames]:
+    """The episode, or the runs of steps in which an expert was asked, where its action is what is imitated.
+
+    Raises what `frames_of_episode` does.
+    """
+    if recipe.action == "action" or episode.expert_actions is None or episode.labelled.all():
+        return [frames_of_episode(episode, recipe, source, notes=notes)]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], episode.labelled, [False]]).astype(int)))
+    filled = replace(episode, expert_actions=np.nan_to_num(episode.expert_actions))
+    whole = frames_of_episode(filled, recipe, source, notes=notes)
+    return [_piece(whole, begin, end) for begin, end in edges.reshape(-1, 2).tolist()]
+
+
+def _piece(frames: EpisodeFrames, begin: int, end: int) -> EpisodeFrames:
+    return replace(
+        frames,
+        source=f"{frames.source} from step {begin}",
+        columns={name: rows[begin:end] for name, rows in frames.columns.items()},
+        pictures={name: Pictures(p.items[begin:end], p.decode) for name, p in frames.pictures.items()},
+        notes={**frames.notes, "start_s": begin / frames.fps},
+    )
 
 
 def _frames(episode: Episode, recipe: ConvertRecipe, source: str, notes: Mapping[str, Any]) -> EpisodeFrames:

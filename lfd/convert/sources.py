@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from lfd.convert.dataset.video import VideoRecipe
-from lfd.convert.features import ConvertRecipe, frames_of_episode
+from lfd.convert.features import ConvertRecipe, pieces_of_episode
 from lfd.convert.foreign.bags import bags_in, frames_of_content, joined
 from lfd.convert.foreign.mapping import MapRecipe, map_recipe
 from lfd.convert.frames import EpisodeFrames
@@ -211,7 +211,7 @@ def frames_of(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
     convert = recipe.convert()
     if not (convert.failures or episode.success):
         return []
-    return [frames_of_episode(episode, convert, str(unit))]
+    return pieces_of_episode(episode, convert, str(unit))
 
 
 def _frames_of_demo(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
@@ -223,7 +223,7 @@ def _frames_of_demo(unit: Unit, recipe: SourceRecipe) -> list[EpisodeFrames]:
     convert, replayed = recipe.convert(), _replayed(unit, recipe)
     if not (convert.failures or replayed.episode.success):
         return []
-    return [frames_of_episode(replayed.episode, convert, str(unit), notes=asdict(replayed.deviation))]
+    return pieces_of_episode(replayed.episode, convert, str(unit), notes=asdict(replayed.deviation))
 
 
 def _replayed(unit: Unit, recipe: SourceRecipe) -> Any:

@@ -75,7 +75,7 @@ CHANNELS: dict[str, Channel] = {row.name: row for row in (
     _row("{arm}_ee_pos", "position of one of two grip sites", "m", "world", "/{arm}_ee_pose", POSE, "position", STATE, "plots/{arm}_ee/position"),
     _row("{arm}_ee_quat", "orientation of one of two grip sites, wxyz", "1", "world", "/{arm}_ee_pose", POSE, "orientation", STATE, "plots/{arm}_ee/orientation"),
     _row("{object}_qpos", "positions of an object's own joints", "rad or m", "joint", "/objects/{object}/joints", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/joints"),
-    _row("{object}_point", "position of a point of an object", "m", "world", "/objects/{object}/point", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/point"),
+    _row("{object}_point", "position of a point of an object, or of the nearest and the mean dirt that is left", "m", "world", "/objects/{object}/point", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/point"),
     _row("{object}_pos", "position of an object's body", "m", "world", "/objects/{object}/pose", POSE, "position", ENVIRONMENT_STATE, "plots/objects/{object}/position"),
     _row("{object}_quat", "orientation of an object's body, wxyz", "1", "world", "/objects/{object}/pose", POSE, "orientation", ENVIRONMENT_STATE, "plots/objects/{object}/orientation"),
     _row("{camera}_picture", "what a camera sees, RGB", "1/255", "camera", "/cameras/{camera}", IMAGE, "data", "observation.images.{camera}", "cameras/{camera}"),

@@ -70,7 +70,7 @@ class Episode:
     interventions: Bool[np.ndarray, "T"]
     """Whether a person or expert overruled the policy in the step."""
     expert_actions: Float[np.ndarray, "T Da"] | None = None
-    """What the expert proposed, where it was asked."""
+    """What the expert proposed; a row of NaN where it was not asked, and none where it never was."""
     sim_states: Float[np.ndarray, "T1 _"] | None = None
     """MuJoCo's integration state at each observation."""
     pictures: Mapping[str, tuple[bytes, ...]] = field(default_factory=dict)
@@ -98,7 +98,8 @@ class Episode:
         }
         rows |= {name: (values, steps + 1) for name, values in self.observations.items()}
         if self.expert_actions is not None:
-            rows["expert_action"] = (self.expert_actions, steps)
+            rows["expert_action"] = (np.where(self.labelled[:, None], self.expert_actions, 0.0), steps)
+            self.expert_actions.flags.writeable = False
         if self.sim_states is not None:
             rows["sim_state"] = (self.sim_states, steps + 1)
         for name, (values, length) in rows.items():
@@ -123,6 +124,13 @@ class Episode:
     def __len__(self) -> int:
         """Number of control steps T."""
         return len(self.actions)
+
+    @property
+    def labelled(self) -> Bool[np.ndarray, "T"]:
+        """In which steps the expert said what it would do."""
+        if self.expert_actions is None:
+            return np.zeros(len(self), dtype=bool)
+        return ~np.asarray(np.isnan(self.expert_actions).all(axis=1))
 
     @property
     def success(self) -> bool:

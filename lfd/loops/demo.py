@@ -13,8 +13,10 @@ from lfd.record.demonstrations import RecordRecipe, record
 from lfd.replay.clip import clip_of
 from lfd.replay.rerun_scene import replay
 from lfd.replay.verify import verify_replay
-from lfd.run.evaluate import EvalRecipe, evaluate
-from lfd.train.behavior_cloning import TrainRecipe, train
+from lfd.run.evaluate import evaluate
+from lfd.run.trial import EvalRecipe
+from lfd.train.behavior_cloning import train
+from lfd.train.recipe import TrainRecipe
 
 
 def demo(

@@ -11,8 +11,10 @@ from lfd.core.errors import RecipeError
 from lfd.core.protocols import Progress, UnitMap, silent
 from lfd.core.recipe import build, load_toml
 from lfd.data.frames import load_frames
-from lfd.run.evaluate import REPORT, EvalRecipe, evaluate
-from lfd.train.behavior_cloning import TrainRecipe, train
+from lfd.run.evaluate import REPORT, evaluate
+from lfd.run.trial import EvalRecipe
+from lfd.train.behavior_cloning import train
+from lfd.train.recipe import TrainRecipe
 from lfd.worlds.robosuite_world import EVERY_CORE
 
 TABLES = ("policy", "train", "eval")

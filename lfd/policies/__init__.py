@@ -5,5 +5,6 @@ and `--policy.type` know them.
 """
 
 from lfd.policies.configuration_bc_mlp import BcMlpConfig
+from lfd.policies.configuration_bc_rnn import BcRnnConfig
 
-__all__ = ["BcMlpConfig"]
+__all__ = ["BcMlpConfig", "BcRnnConfig"]

@@ -238,7 +238,6 @@ def _decode(content: McapContent, about: dict[str, str], with_states: bool) -> E
     step_names, steps = arrays(_data(content, "/step"))
     columns = dict(zip(step_names, steps.T, strict=True))
     stamps = np.array([stamp for stamp, _ in _messages(content, "/joint_states")], dtype=np.int64)
-    expert = CHANNELS["expert_action"].topic
     return Episode(
         times=(stamps - stamps[0]) / 1e9,
         observations=_observed(content, labels),
@@ -246,7 +245,7 @@ def _decode(content: McapContent, about: dict[str, str], with_states: bool) -> E
         rewards=columns["reward"],
         successes=columns["success"] > 0.5,
         interventions=columns["intervention"] > 0.5,
-        expert_actions=arrays(_data(content, expert))[1] if expert in content.messages else None,
+        expert_actions=_expert_actions(content),
         sim_states=arrays(_data(content, "/sim/state"))[1] if with_states else None,
         pictures={
             topic.removeprefix(CAMERAS): tuple(cdr.unpack_image(data) for _, data in messages)
@@ -273,6 +272,22 @@ def _messages(content: McapContent, topic: str) -> list[tuple[int, bytes]]:
 
 def _data(content: McapContent, topic: str) -> list[bytes]:
     return [data for _, data in _messages(content, topic)]
+
+
+def _expert_actions(content: McapContent) -> np.ndarray | None:
+    """A row for each step, of NaN where the expert was not asked: its message has the time of the action."""
+    expert = CHANNELS["expert_action"].topic
+    if expert not in content.messages:
+        return None
+    steps = np.array([stamp for stamp, _ in _messages(content, "/action")], dtype=np.int64)
+    asked = np.array([stamp for stamp, _ in _messages(content, expert)], dtype=np.int64)
+    strange = np.setdiff1d(asked, steps)
+    if len(strange):
+        raise RecordingError(f"topic {expert} has a message at {strange[0]} ns, when there is no action")
+    said = arrays(_data(content, expert))[1]
+    rows = np.full((len(steps), said.shape[1]), np.nan)
+    rows[np.searchsorted(steps, asked)] = said
+    return rows
 
 
 def _observed(content: McapContent, labels: Labels) -> dict[str, np.ndarray]:

@@ -2,46 +2,24 @@
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from lfd.core.artifact import new_folder, packed, sha256, unpack, write_json, write_manifest
-from lfd.core.errors import RecipeError
-from lfd.core.protocols import Progress, UnitMap, World, batches, silent
-from lfd.core.recipe import as_table
-from lfd.policies.acting import AskedOnce, LearnedPolicy, about_policy, load_policy
+from lfd.core.protocols import Observer, Progress, UnitMap, batches, silent
+from lfd.policies.acting import load_policy
 from lfd.record.episode_file import McapRecorder, Origin
 from lfd.record.mcap_file import SUFFIX
+from lfd.run.trial import EvalRecipe, Trial
 from lfd.run.wilson import wilson_interval
-from lfd.worlds.robosuite_world import EVERY_CORE, kept_world, make_worlds
+from lfd.worlds.robosuite_world import EVERY_CORE, RobosuiteWorld, kept_world, make_worlds
 from lfd.worlds.robots import RobotConfig, load_robot
-from lfd.worlds.rollout import Start, episode_rng, rollouts
 
 STAGE = "eval"
 REPORT = "report.json"
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvalRecipe:
-    """The `[eval]` table of a file in `policies/`."""
-
-    episodes: int
-    """Start states to try."""
-    seed: int
-    """Seed of the start states; they differ from those of recordings of the same seed."""
-    max_seconds: float
-    """Simulated time after which an episode has failed [s]."""
-    hold_seconds: float
-    """Simulated time for which the task must stay solved [s]."""
-
-    def check(self, where: str) -> None:
-        for key in ("episodes", "max_seconds", "hold_seconds"):
-            if getattr(self, key) <= 0:
-                raise RecipeError(f"{where} {key} = {getattr(self, key)}: must be greater than 0")
-        if self.seed < 0:
-            raise RecipeError(f"{where} seed = {self.seed}: must not be negative")
+Row = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,6 +51,9 @@ def evaluate(
     recipe: EvalRecipe,
     out: Path,
     *,
+    robot: str | None = None,
+    forced: bool = False,
+    dataset: Path | None = None,
     most_worlds: int = EVERY_CORE,
     cluster: UnitMap | None = None,
     overwrite: bool = False,
@@ -81,23 +62,25 @@ def evaluate(
     """Run a policy from `recipe.episodes` start states; recordings and the report land in the folder `out`.
 
     Worlds run in parallel, one a core, `most_worlds` at the most, or on the machines of a `cluster`; the result
-    does not depend on where, nor on how many. Raises `PolicyError` for a policy that cannot be loaded,
-    `OutputError` when `out` exists.
+    does not depend on where, nor on how many. `robot` is another robot than the policy was trained for, which must be
+    `forced`; `dataset` is what a policy that LeRobot trained was trained on, where its folder does not say so.
+
+    Raises `PolicyError` for a policy that cannot be loaded, `OutputError` when `out` exists.
     """
-    about = about_policy(policy)
-    used = {**about["recipe"], "eval": as_table(recipe)}
+    trial = Trial.of(policy, recipe, robot=robot, forced=forced, dataset=dataset)
+    about, used = trial.about, trial.used
     began = time.perf_counter()
     with new_folder(out, overwrite=overwrite) as part:
         (part / "episodes").mkdir()
         if cluster is None:
             most = min(most_worlds, recipe.episodes)
-            worlds = make_worlds(about["task"], about["robot"], about["control_hz"], most=most, progress=progress)
+            worlds = make_worlds(about["task"], trial.robot, about["control_hz"], most=most, progress=progress)
             stepping = time.perf_counter()
-            ended = _run(worlds, policy, recipe, range(recipe.episodes), part / "episodes")
+            ended = _run(worlds, trial, range(recipe.episodes), part / "episodes")
         else:
             load_policy(policy)  # a policy that cannot be loaded shows here and not on a worker
             stepping = time.perf_counter()
-            ended = _run_on(cluster, policy, recipe, part / "episodes")
+            ended = _run_on(cluster, trial, part / "episodes")
         rows = []
         with progress(f"evaluate {about['task']}", recipe.episodes) as bar:
             for row in ended:
@@ -110,56 +93,42 @@ def evaluate(
         write_json(part / REPORT, asdict(report))
         write_manifest(
             part, kind="evaluation", recipe=used, parents={str(policy): sha256(policy)}, seed=recipe.seed,
-            task=about["task"], robot=about["robot"], policy=about["policy"],
+            task=about["task"], robot=trial.robot, policy=about["policy"],
         )  # fmt: skip
     return report
 
 
-def _run(
-    worlds: Sequence[World], policy: Path, recipe: EvalRecipe, indices: Sequence[int], episodes: Path
-) -> Iterator[dict[str, Any]]:
+def _run(worlds: Sequence[RobosuiteWorld], trial: Trial, indices: Sequence[int], episodes: Path) -> Iterator[Row]:
     """Run the episodes of some numbers and record them into a folder; a row for each, its index and its outcome."""
-    learned, hz = LearnedPolicy(policy, worlds[0].spec), worlds[0].spec.control_hz
-    used = {**about_policy(policy)["recipe"], "eval": as_table(recipe)}
 
-    def start(index: int) -> Start:
-        origin = Origin(stage=STAGE, policy=learned.name, seed=recipe.seed, index=index, recipe=used)
-        recorder = McapRecorder(episodes / f"episode_{index:06d}{SUFFIX}", origin, keep_failures=True)
-        return Start(index=index, rng=episode_rng(STAGE, recipe.seed, index), observers=[recorder])
+    def recorders(index: int) -> list[Observer]:
+        about, recipe = trial.about, trial.recipe
+        origin = Origin(stage=STAGE, policy=about["policy"], seed=recipe.seed, index=index, recipe=trial.used)
+        return [McapRecorder(episodes / f"episode_{index:06d}{SUFFIX}", origin, keep_failures=True)]
 
-    waiting = iter(indices)
-    ended = rollouts(
-        worlds,
-        AskedOnce(learned),
-        lambda: next((start(index) for index in waiting), None),
-        horizon=round(recipe.max_seconds * hz),
-        hold_steps=max(1, round(recipe.hold_seconds * hz)),
-    )
-    for begun, outcome in ended:
-        yield {"index": begun.index, **asdict(outcome)}
+    for index, outcome in trial.run(worlds, STAGE, indices, recorders):
+        yield {"index": index, **asdict(outcome)}
 
 
-def _run_on(cluster: UnitMap, policy: Path, recipe: EvalRecipe, episodes: Path) -> Iterator[dict[str, Any]]:
+def _run_on(cluster: UnitMap, trial: Trial, episodes: Path) -> Iterator[Row]:
     """Run all episodes on a cluster; their recordings come back as bytes."""
-    robot = load_robot(about_policy(policy)["robot"])
-    shared = packed(policy), recipe, robot
-    for _, (rows, files) in cluster(_unit, shared, batches(recipe.episodes, cluster.cpus)):
+    shared = packed(trial.policy), trial, load_robot(trial.robot)
+    for _, (rows, files) in cluster(_unit, shared, batches(trial.recipe.episodes, cluster.cpus)):
         unpack(files, episodes)
         yield from rows
 
 
 def _unit(
-    shared: tuple[dict[str, bytes], EvalRecipe, RobotConfig], indices: Sequence[int]
-) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+    shared: tuple[dict[str, bytes], Trial, RobotConfig], indices: Sequence[int]
+) -> tuple[list[Row], dict[str, bytes]]:
     """A worker's part of an evaluation: rows, and recordings by name."""
-    files, recipe, robot = shared
+    files, trial, robot = shared
     with TemporaryDirectory() as folder:
         policy, episodes = Path(folder) / "policy", Path(folder) / "episodes"
         unpack(files, policy)
         episodes.mkdir()
-        about = about_policy(policy)
-        world = kept_world(about["task"], about["robot"], robot, about["control_hz"])
-        return list(_run([world], policy, recipe, indices, episodes)), packed(episodes)
+        world = kept_world(trial.about["task"], trial.robot, robot, trial.about["control_hz"])
+        return list(_run([world], replace(trial, policy=policy), indices, episodes)), packed(episodes)
 
 
 def make_report(rows: Sequence[Mapping[str, Any]], recipe: EvalRecipe, seconds: float, stepping: float) -> Report:

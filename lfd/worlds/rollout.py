@@ -23,7 +23,8 @@ from lfd.core.protocols import (
     WorldState,
 )
 
-STAGES = ("record", "eval")
+STAGES = ("record", "eval", "judge", "dagger")
+"""What has a random stream of its own; the order is part of the seed."""
 
 
 @dataclass(frozen=True)

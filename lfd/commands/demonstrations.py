@@ -1,4 +1,4 @@
-"""What each command of the command line does: from its arguments to the result that is shown.
+"""Commands on demonstrations: record and convert them, check where they come from.
 
 Every command imports its stage when it runs, so that `lfd --help` answers at once.
 """
@@ -8,17 +8,61 @@ from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
+from lfd.commands.options import (
+    ALL_WORLDS,
+    Commands,
+    Result,
+    cluster,
+    count,
+    machines,
+    output,
+    overrides,
+    parallel,
+    put,
+    short,
+)
 from lfd.core.errors import InputError
+from lfd.experts.keys import HELP
 
-Result = dict[str, Any]
-ALL_WORLDS = 2**16
-"""More worlds than any machine has cores: as many as it has."""
 MOST_NOTES = 10
 """Episodes whose notes are printed."""
 USUAL = ("start_s", "pieces")
 """Notes that only matter beside others."""
+
+
+def add(commands: Commands) -> None:
+    """The commands of this module."""
+    _record(commands)
+    _convert(commands)
+    _verify(commands)
+    _export(commands)
+    _trace(commands)
+    _recover(commands)
+
+
+def _record(commands: Commands) -> None:
+    made = commands.add(
+        "record",
+        run_record,
+        "record demonstrations of a task into MCAP files, one an episode",
+        "lfd record datasets/lift_panda.toml --episodes 50 --out outputs/recordings",
+    )
+    made.add_argument("recipe", type=Path, metavar="RECIPE", help="dataset recipe, a TOML file with a [record] table")
+    made.add_argument("--episodes", type=int, metavar="N", help="successful demonstrations to record")
+    made.add_argument("--seed", type=int, metavar="S", help="seed of start states and noise")
+    made.add_argument(
+        "--device", metavar="DEVICE",
+        help="you demonstrate, with keyboard, spacemouse or gamepad, instead of the scripted expert; keys are below",
+    )  # fmt: skip
+    made.add_argument("--no-view", action="store_true", help="with --device: no live view of the robot")
+    made.add_argument("--resume", action="store_true", help="go on with the recordings of the folder")
+    made.epilog += f"\n         lfd record datasets/lift_panda.toml --device keyboard --out outputs/mine\n\n{HELP}"
+    parallel(made)
+    output(made, "the recordings")
+    overrides(made)
 
 
 def run_record(given: Namespace) -> Result:
@@ -28,13 +72,13 @@ def run_record(given: Namespace) -> Result:
     from lfd.terminal import progress_bar
 
     tables = load_toml(given.recipe, ("record", "convert", "video"), given.set)
-    _put(tables, "record", episodes=given.episodes, seed=given.seed)
+    put(tables, "record", episodes=given.episodes, seed=given.seed)
     recipe = build(RecordRecipe, tables.get("record", {}), f"{given.recipe} [record]")
     if given.device is not None:
         return _record_person(given, recipe, tables)
     if given.no_view:
         raise InputError("--no-view is for people: choose their device with --device keyboard, spacemouse or gamepad")
-    with _machines(given.cluster) as cluster:
+    with machines(given.cluster) as cluster:
         done = record(
             recipe,
             given.out,
@@ -91,13 +135,44 @@ def _live_view(wanted: bool) -> Iterator[Any]:
         yield view
 
 
+def _convert(commands: Commands) -> None:
+    made = commands.add(
+        "convert",
+        run_convert,
+        "convert recordings into a LeRobot v3 dataset and verify it by reading both back",
+        "lfd convert outputs/recordings --out outputs/dataset",
+    )
+    made.add_argument(
+        "sources", type=Path, nargs="+", metavar="FILE|DIR",
+        help="recordings of lfd, MCAP files of other programs, ROS 2 bags, robosuite's or robomimic's HDF5 files, or "
+        "folders of them",
+    )  # fmt: skip
+    made.add_argument(
+        "--recipe", type=Path, metavar="RECIPE",
+        help="dataset recipe: its [convert] table says what becomes what (default: the one kept in the recordings), "
+        "[resample] and [map.NAME] do for files of other programs, [video] how pictures are kept",
+    )  # fmt: skip
+    made.add_argument("--append", action="store_true", help="add the episodes to the dataset that is there")
+    made.add_argument(
+        "--skip-bad",
+        action="store_true",
+        help="leave out recordings that cannot be used, and list them, instead of ending",
+    )
+    made.add_argument(
+        "--trust-rows", action="store_true", help="in HDF5 files whose own counts differ from their rows, take the rows"
+    )
+    made.add_argument("--jobs", type=count, metavar="N", help="processes that read (default: what is worth it)")
+    cluster(made)
+    output(made, "the dataset")
+
+
 def run_convert(given: Namespace) -> Result:
     """A dataset from recordings."""
     from lfd.convert.sources import SourceRecipe
     from lfd.convert.to_lerobot import convert
     from lfd.terminal import progress_bar
 
-    with _machines(given.cluster) as cluster:
+    with machines(given.cluster) as cluster:
         done = convert(
             given.sources,
             given.out,
@@ -123,7 +198,24 @@ def _noteworthy(note: Result) -> str:
     """What a person should know of a converted episode: gaps, a recovery, how far a replay went away."""
     plain = {k: v for k, v in note.items() if isinstance(v, (str, int, float)) and v != "" and k not in USUAL}
     listed = {k: f"{len(v)} ({v[0]})" for k, v in note.items() if isinstance(v, (list, tuple)) and v}
-    return ", ".join(f"{k} {_short(v)}" for k, v in {**plain, **listed}.items())
+    return ", ".join(f"{k} {short(v)}" for k, v in {**plain, **listed}.items())
+
+
+def _verify(commands: Commands) -> None:
+    made = commands.add(
+        "verify",
+        run_verify,
+        "compare every number, task, unit and boundary of a dataset with its sources",
+        "lfd verify outputs/dataset outputs/recordings",
+    )
+    made.add_argument("dataset", type=Path, metavar="DATASET", help="LeRobot dataset folder")
+    made.add_argument("sources", type=Path, nargs="+", metavar="FILE|DIR", help="what it was converted from, in order")
+    made.add_argument(
+        "--recipe",
+        type=Path,
+        metavar="RECIPE",
+        help="recipe of the conversion (default: the one that the dataset keeps)",
+    )
 
 
 def run_verify(given: Namespace) -> Result:
@@ -135,6 +227,27 @@ def run_verify(given: Namespace) -> Result:
     recipe = SourceRecipe.load(given.recipe) if given.recipe else None
     compared = verify(given.dataset, given.sources, recipe=recipe, progress=progress_bar)
     return {"dataset": str(given.dataset), "numbers_equal": compared}
+
+
+def _export(commands: Commands) -> None:
+    made = commands.add(
+        "export",
+        run_export,
+        "write episodes as MCAP files, or as an HDF5 file on which robomimic trains",
+        "lfd export outputs/recordings --to robomimic --out outputs/demos.hdf5",
+    )
+    made.add_argument(
+        "sources", type=Path, nargs="+", metavar="FILE|DIR|DATASET",
+        help="one LeRobot dataset, or recordings, HDF5 demonstrations, or folders of them",
+    )  # fmt: skip
+    made.add_argument("--to", required=True, choices=["mcap", "robomimic"], help="format")
+    made.add_argument(
+        "--seed", type=int, default=0, metavar="S", help="robomimic: draws the tenth for validation (default: 0)"
+    )
+    made.add_argument(
+        "--trust-rows", action="store_true", help="in HDF5 files whose own counts differ from their rows, take the rows"
+    )
+    output(made, "the MCAP files, or the HDF5 file")
 
 
 def run_export(given: Namespace) -> Result:
@@ -154,12 +267,32 @@ def run_export(given: Namespace) -> Result:
     return asdict(done)
 
 
+def _trace(commands: Commands) -> None:
+    made = commands.add(
+        "trace",
+        run_trace,
+        "print the chain policy, dataset, recordings, and whether each is still what it was",
+        "lfd trace outputs/policy",
+    )
+    made.add_argument("path", type=Path, metavar="PATH", help="folder of a dataset, policy, evaluation or export")
+
+
 def run_trace(given: Namespace) -> Result:
     """Where an artifact comes from."""
     from lfd.trace import as_json, lines_of, trace
 
     origin = trace(given.path)
     return as_json(origin) if given.json else {"lines": lines_of(origin)}
+
+
+def _recover(commands: Commands) -> None:
+    made = commands.add(
+        "recover",
+        run_recover,
+        "make episodes of what a crash left, and of damaged recordings what is whole of them",
+        "lfd recover outputs/recordings",
+    )
+    made.add_argument("folder", type=Path, metavar="DIR", help="folder of recordings")
 
 
 def run_recover(given: Namespace) -> Result:
@@ -173,155 +306,3 @@ def run_recover(given: Namespace) -> Result:
     if not rows:
         return {str(given.folder): "every recording is whole"}
     return {row["path"]: f"{row['episode'] or 'nothing saved'}\n{row['note']}" for row in rows}
-
-
-def run_train(given: Namespace) -> Result:
-    """A policy from a dataset."""
-    from lfd.core.recipe import build, load_toml
-    from lfd.run.evaluate import EvalRecipe
-    from lfd.terminal import progress_bar
-    from lfd.train.behavior_cloning import TrainRecipe, train
-
-    tables = load_toml(given.recipe, ("policy", "train", "eval"), given.set)
-    _put(tables, "train", steps=given.steps, seed=given.seed)
-    recipe = build(TrainRecipe, tables.get("train", {}), f"{given.recipe} [train]")
-    build(EvalRecipe, tables.get("eval", {}), f"{given.recipe} [eval]")  # a mistake in it shows before training
-    done = train(
-        tables.get("policy", {}),
-        recipe,
-        given.dataset,
-        given.out,
-        tables=tables,
-        overwrite=given.overwrite,
-        progress=progress_bar,
-    )
-    return {"out": str(given.out), **asdict(done)}
-
-
-def run_evaluate(given: Namespace) -> Result:
-    """How often a policy succeeds."""
-    from lfd.core.recipe import build
-    from lfd.policies.acting import about_policy
-    from lfd.run.evaluate import EvalRecipe, evaluate
-    from lfd.terminal import progress_bar
-
-    tables = about_policy(given.policy)["recipe"]
-    _put(tables, "eval", episodes=given.episodes, seed=given.seed)
-    recipe = build(EvalRecipe, tables["eval"], f"{given.policy} [eval]")
-    with _machines(given.cluster) as cluster:
-        done = evaluate(
-            given.policy,
-            recipe,
-            given.out,
-            most_worlds=given.worlds,
-            cluster=cluster,
-            overwrite=given.overwrite,
-            progress=progress_bar,
-        )
-    report = asdict(done)
-    del report["per_episode"]
-    return {"out": str(given.out), **report}
-
-
-def run_sweep(given: Namespace) -> Result:
-    """Policies for every combination of some values."""
-    from lfd.loops.sweep import sweep
-    from lfd.terminal import progress_bar
-
-    with _machines(given.cluster) as cluster:
-        rows = sweep(
-            given.recipe,
-            given.vary,
-            given.dataset,
-            given.out,
-            cluster=cluster,
-            overwrite=given.overwrite,
-            progress=progress_bar,
-        )
-    if given.json:
-        return {"out": str(given.out), "rows": rows}
-    best = {row.pop("folder"): ", ".join(f"{k} {_short(v)}" for k, v in row.items()) for row in rows}
-    return {"out": str(given.out), **best}
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_short, value)) + "]"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-
-def run_replay(given: Namespace) -> Result:
-    """An episode in Rerun, or its exact replay."""
-    from lfd.replay.clip import clip_of
-    from lfd.replay.rerun_scene import replay
-    from lfd.replay.verify import verify_replay
-
-    if given.verify:
-        found = asdict(verify_replay(given.source, given.episode))
-        found["failed"] = found["deviation"] > 0
-        return found
-    clip = clip_of(given.source, given.episode)
-    replay(clip, save=given.save, overwrite=given.overwrite)
-    shown = {"saved": str(given.save), "bytes": given.save.stat().st_size} if given.save else {"viewer": "opened"}
-    return {"episode": clip.title, "seconds": float(clip.times[-1]), **shown}
-
-
-def run_info(given: Namespace) -> Result:
-    """What a file or folder holds."""
-    from lfd.about import about
-
-    return about(given.path)
-
-
-def run_doctor(given: Namespace) -> Result:
-    """What of this machine works."""
-    del given
-    from lfd.doctor import examine
-
-    checks = examine()
-    marks = {c.name: f"{'ok' if c.works else 'BROKEN' if c.needed else 'no'}: {c.detail}" for c in checks}
-    return {**marks, "failed": any(c.needed and not c.works for c in checks)}
-
-
-def run_demo(given: Namespace) -> Result:
-    """The whole thread at once."""
-    from lfd.loops.demo import demo, rows_of
-    from lfd.loops.results import write_section
-    from lfd.terminal import progress_bar
-
-    recipes = given.dataset_recipe, given.policy_recipe
-    measured = demo(*recipes, given.out, overwrite=given.overwrite, progress=progress_bar)
-    if given.results is not None:
-        write_section(given.results, "The thread on Lift with a Panda", "lfd demo", rows_of(measured))
-    return measured if given.json else dict(rows_of(measured))
-
-
-def run_bench(given: Namespace) -> Result:
-    """Speed, side by side."""
-    from lfd.bench.suites import SUITES
-    from lfd.loops.results import write_section
-
-    measured, sections = SUITES[given.suite](given)
-    if given.results is not None:
-        command = f"lfd bench {given.suite}" + " --quick" * given.quick + " --full" * given.full
-        for title, rows in sections.items():
-            write_section(given.results, title, command, rows)
-    return measured
-
-
-@contextmanager
-def _machines(address: str | None) -> Iterator[Any]:
-    """The cluster that was asked for, or none."""
-    if address is None:
-        yield None
-        return
-    from lfd.cluster import connect
-
-    with connect(address) as cluster:
-        print(f"{cluster.cpus} cores in the Ray cluster {address}", file=sys.stderr)
-        yield cluster
-
-
-def _put(tables: dict[str, dict[str, Any]], table: str, **values: Any) -> None:
-    """Put the options that were given over the recipe's keys."""
-    tables.setdefault(table, {}).update({key: value for key, value in values.items() if value is not None})
