@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from lfd import make_world
 from lfd.core.protocols import Decision
 from lfd.experts.lift import LiftExpert
 from lfd.experts.noise import NoisyPolicy
@@ -64,3 +65,16 @@ def test_noise_is_applied_and_the_label_stays_clean(lift_world) -> None:
     assert abs(meant[1]) < 0.2
     assert away.std() == pytest.approx(0.3, rel=0.15)
     assert np.corrcoef(away[:-1], away[1:])[0, 1] == pytest.approx(0.8, abs=0.08)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("robot", "horizon"), [("ur5e", 200), ("iiwa", 200), ("kinova3", 200), ("sawyer", 200), ("jaco", 300)]
+)
+def test_the_same_expert_lifts_with_every_arm(robot, horizon) -> None:
+    world = make_world("Lift", robot, 20)
+    expert = LiftExpert(world.spec)
+    outcomes = [
+        rollout(world, expert, [], episode_rng("eval", 43, i), horizon=horizon, hold_steps=10) for i in range(20)
+    ]
+    assert sum(outcome.success for outcome in outcomes) >= 19

@@ -19,6 +19,10 @@ class Word(StrEnum):
     """Open the gripper if it is closed, else close it."""
     SLOWER = "slower"
     FASTER = "faster"
+    TAKE_OVER = "take over"
+    """Act in the place of a learner that is in control."""
+    HAND_BACK = "hand back"
+    """Let the learner act again."""
 
 
 AXES: tuple[str, ...] = ("x", "y", "z", "rx", "ry", "rz")
@@ -49,6 +53,8 @@ WORDS: dict[str, Word] = {
     "-": Word.SLOWER,
     "=": Word.FASTER,
     "+": Word.FASTER,
+    "t": Word.TAKE_OVER,
+    "b": Word.HAND_BACK,
 }
 """Key to a word."""
 
@@ -63,6 +69,7 @@ keys of --device keyboard (directions as you see the robot in the live view; `fr
   space              close or open the gripper        - =      slower, faster
 words, which the keyboard says whatever the device:
   Enter start   y success   n failure (kept as such)   x discard   z redo from the same start   q quit
+  beside a learner: t take over (so does moving the device)   b hand back
 SpaceMouse: push and turn the cap; left button: gripper; right button: start, then success.
 gamepad: left stick and triggers (right up, left down) move, right stick and left/right of the cross turn; A (cross):
   gripper; Start: start, then success; B (circle): failure; X, Y: discard; Select: redo; guide: quit; bumpers: speed.

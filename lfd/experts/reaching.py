@@ -18,7 +18,6 @@ POSITION_GAIN = 2.0
 ROTATION_GAIN = 1.0
 """Action, as a multiple of the remaining turn in units of STEP_RAD."""
 OPEN, CLOSE = -1.0, 1.0
-DOWN = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,8 @@ def above(point: Float[np.ndarray, "3"], height: float) -> Float[np.ndarray, "3"
 
 def pointing_down(yaw: float) -> Float[np.ndarray, "3 3"]:
     """R_world_hand of a hand that points down, its x axis turned by `yaw` [rad] about the world's z."""
-    x_axis = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-    return np.column_stack([x_axis, np.cross(DOWN, x_axis), DOWN])
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
 
 
 def nearest_yaw(yaw: float, wanted: float, period: float) -> float:
@@ -80,3 +79,9 @@ def nearest_yaw(yaw: float, wanted: float, period: float) -> float:
 def yaw_of(rotation: Float[np.ndarray, "3 3"]) -> float:
     """Angle of a frame's x axis about the world's z [rad]."""
     return float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+def side_yaw(rotation: Float[np.ndarray, "3 3"]) -> float:
+    """Angle about the world's z of a side of a box [rad], whichever face it lies on: that of its most level axis."""
+    axis = rotation[:, np.argmin(np.abs(rotation[2]))]
+    return float(np.arctan2(axis[1], axis[0]))

@@ -7,11 +7,21 @@ from contextlib import AbstractContextManager, contextmanager
 from lfd.core.errors import InputError, UnknownName
 from lfd.core.protocols import Policy, WorldSpec
 from lfd.experts.device import Device, WithKeyboard
+from lfd.experts.door import DoorExpert
 from lfd.experts.lift import LiftExpert
+from lfd.experts.nut_assembly_square import NutAssemblySquareExpert
+from lfd.experts.pick_place_can import PickPlaceCanExpert
+from lfd.experts.stack import StackExpert
 from lfd.experts.style import PLAIN, ExpertStyle
+from lfd.experts.two_arm_lift import TwoArmLiftExpert
 
 EXPERTS: dict[str, Callable[[WorldSpec, ExpertStyle], Policy]] = {
+    "Door": DoorExpert,
     "Lift": LiftExpert,
+    "NutAssemblySquare": NutAssemblySquareExpert,
+    "PickPlaceCan": PickPlaceCanExpert,
+    "Stack": StackExpert,
+    "TwoArmLift": TwoArmLiftExpert,
 }
 
 

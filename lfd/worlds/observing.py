@@ -4,7 +4,7 @@ The array's layout is a list of channels (`lfd.core.channels`), each a run of co
 of one kind stand together, so that reading the state is one indexing operation for each of MjData's arrays.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import mujoco
@@ -16,6 +16,7 @@ from lfd.worlds.steppers import arms_of
 from lfd.worlds.tasks import Task
 
 Labels = Mapping[str, tuple[str, ...]]
+DIRT = ("nearest_dirt_point", "mean_dirt_point")
 
 
 class Sight:
@@ -24,8 +25,8 @@ class Sight:
     Channels: `joint_pos` [rad], `joint_vel` [rad/s], `joint_effort` [N m] of all arms, one after the other;
     `gripper_pos` [m], `gripper_vel` [m/s], `gripper_effort` [N] of the fingers; `ee_pos` [m] and `ee_quat` (wxyz)
     of the grip site, named `ARM_ee_pos` where there are two arms; `NAME_pos` [m] and `NAME_quat` (wxyz) of each
-    object that moves; `NAME_qpos` of an object with joints of its own [rad or m]; `NAME_point` [m]. Poses are
-    in the world frame.
+    object that moves; `NAME_qpos` of an object with joints of its own [rad or m]; `NAME_point` [m]; where there is
+    dirt, `nearest_dirt_point` and `mean_dirt_point` [m] of what is left of it. Poses are in the world frame.
     """
 
     labels: Labels
@@ -74,12 +75,17 @@ class Sight:
         for name in hands:
             self.labels[f"{name}_quat"], self.slices[f"{name}_quat"] = WXYZ, slice(at, at + 4)
             at += 4
+        markers = getattr(env.model.mujoco_arena, "markers", ())
+        for name in DIRT if markers else ():
+            self.labels[name], self.slices[name] = XYZ, slice(at, at + 3)
+            at += 3
         self.size, self._seen = at, np.empty(at)
         self._reads = [(source, index, self._seen[place]) for source, index, place in reads]
         self._turns = [
             (data.site_xmat[model.site(site).id], self._seen[self.slices[f"{name}_quat"]])
             for name, site in hands.items()
         ]
+        self._dirt = _Dirt(model, data, markers, *hands.values()) if markers else None
 
     def read(self) -> Float[np.ndarray, "Do"]:
         """The present observation; the same array at every call."""
@@ -87,11 +93,32 @@ class Sight:
             source.take(index, out=target, mode="clip")  # any other mode copies once more
         for matrix, target in self._turns:
             mujoco.mju_mat2Quat(target, matrix)
+        if self._dirt is not None:
+            for name, point in zip(DIRT, self._dirt.left(), strict=True):
+                self._seen[self.slices[name]] = point
         return self._seen
 
     def named(self, vector: Float[np.ndarray, "Do"]) -> dict[str, Float[np.ndarray, "_"]]:
         """An observation vector by channel: views, not copies."""
         return {name: vector[place] for name, place in self.slices.items()}
+
+
+class _Dirt:
+    """The dirt of a table: markers, which robosuite makes transparent when they are wiped."""
+
+    def __init__(self, model: Any, data: Any, markers: Sequence[Any], tool: str):
+        self._model, self._data, self._tool = model, data, model.site(tool).id
+        self._bodies = np.array([model.body(marker.root_body).id for marker in markers])
+        self._geoms = np.array([model.geom(marker.visual_geoms[0]).id for marker in markers])
+
+    def left(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        """What is left: the marker nearest to the tool, and the mean of all; the tool itself where none is left [m]."""
+        tool = self._data.site_xpos[self._tool]
+        places = self._data.xpos[self._bodies[self._model.geom_rgba[self._geoms, 3] > 0]]
+        if len(places) == 0:
+            return tool, tool
+        away = places - tool
+        return places[np.argmin(np.einsum("mi,mi->m", away, away))], places.mean(axis=0)
 
 
 def _named_arms(env: Any) -> list[tuple[str, Any, str]]:

@@ -31,7 +31,7 @@ TASKS: dict[str, Task] = {
         Task("Stack", "stack the red cube on the green cube"),
         Task("NutAssembly", _NUTS),
         Task("NutAssemblySingle", "put the nut on its peg"),
-        Task("NutAssemblySquare", "put the square nut on the square peg"),
+        Task("NutAssemblySquare", "put the square nut on the square peg", bodies={"peg": "peg1"}),
         Task("NutAssemblyRound", "put the round nut on the round peg"),
         Task("PickPlace", _BINS),
         Task("PickPlaceSingle", "put the object into its bin"),

@@ -1,0 +1,136 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lfd.core.errors import InputError
+from lfd.core.protocols import Decision
+from lfd.experts.noise import NoisyPolicy
+from lfd.experts.style import ExpertStyle
+from lfd.experts.wipe import YAWS, WipeExpert
+from lfd.run.wilson import wilson_interval
+from lfd.worlds.rollout import episode_rng, rollout
+
+
+@pytest.fixture(scope="module")
+def world():
+    from lfd import make_world
+
+    return make_world("Wipe", "panda", 20)
+
+
+def successes(world, policy, seed: int, episodes: int, horizon: int = 400) -> int:
+    return sum(
+        rollout(world, policy, [], episode_rng("eval", seed, i), horizon=horizon, hold_steps=10).success
+        for i in range(episodes)
+    )
+
+
+class Disturbed:
+    """The expert, with something happening at a step of its episode."""
+
+    name = "disturbed"
+
+    def __init__(self, expert, happens):
+        self.expert, self.happens = expert, happens
+
+    def reset(self, rng):
+        self.expert.reset(rng)
+        self.step, self.rng = 0, rng
+
+    def act(self, observation):
+        self.step += 1
+        return self.happens(self) or self.expert.act(observation)
+
+
+@pytest.mark.slow
+def test_wipe_succeeds_from_at_least_98_percent_of_200_starts(world) -> None:
+    found = successes(world, WipeExpert(world.spec), 41, 200)
+    assert found >= 196, wilson_interval(found, 200)
+
+
+@pytest.mark.slow
+def test_it_succeeds_with_noise_at_every_speed_and_with_the_tool_either_way(world) -> None:
+    expert = WipeExpert(world.spec, ExpertStyle(speed=(0.6, 1.0), approach="any"))
+    assert successes(world, NoisyPolicy(expert, scale=0.1), 43, 20) >= 18
+
+
+@pytest.mark.slow
+def test_the_expert_recovers_from_pushes(world) -> None:
+    """Half a second of random actions, at any time: the tool is tilted, pushed into the table and away from it."""
+
+    def push(me):
+        if me.step == 1:
+            me.at = me.rng.integers(5, 60)
+        return Decision(me.rng.uniform(-1, 1, 6)) if me.at <= me.step < me.at + 10 else None
+
+    assert successes(world, Disturbed(WipeExpert(world.spec), push), 42, 20) >= 18
+
+
+def test_the_expert_wipes_what_is_spilt_again(world) -> None:
+    """Some of the dirt that was wiped is back, away from the tool."""
+
+    def spill(me):
+        if me.step == 40:
+            wiped = world._env.wiped_markers
+            for marker in wiped[:10]:
+                world._model.geom(marker.visual_geoms[0]).rgba[3] = 1.0
+            del wiped[:10]
+
+    assert successes(world, Disturbed(WipeExpert(world.spec), spill), 44, 5) >= 5
+
+
+def test_the_dirt_that_is_observed_is_the_dirt_that_robosuite_has_left(world) -> None:
+    expert = WipeExpert(world.spec)
+    expert.reset(np.random.default_rng(0))
+    seen = world.reset(np.random.default_rng(2))
+    is_clean, step = False, 0
+    while not is_clean:
+        left = [m for m in world._env.model.mujoco_arena.markers if m not in world._env.wiped_markers]
+        places = np.array([world._data.body(m.root_body).xpos for m in left])
+        distances = np.linalg.norm(places - seen["ee_pos"], axis=1)
+        assert np.linalg.norm(seen["nearest_dirt_point"] - seen["ee_pos"]) == pytest.approx(distances.min())
+        np.testing.assert_allclose(seen["mean_dirt_point"], places.mean(axis=0))
+        if step == 30:
+            assert len(left) < 100
+            np.testing.assert_array_equal(
+                world.set_state(world.get_state())["mean_dirt_point"], seen["mean_dirt_point"]
+            )
+        result = world.step(expert.act(seen).action)
+        seen, is_clean, step = result.observation, result.success, step + 1
+        assert step < 200
+    np.testing.assert_array_equal(seen["nearest_dirt_point"], seen["ee_pos"])
+    np.testing.assert_array_equal(seen["mean_dirt_point"], seen["ee_pos"])
+
+
+def test_the_same_observation_gives_the_same_action(world) -> None:
+    first, second = WipeExpert(world.spec), WipeExpert(world.spec)
+    seen = world.reset(np.random.default_rng(1))
+    for _ in range(25):
+        seen = world.step(first.act(seen).action).observation
+    np.testing.assert_array_equal(first.act(seen).action, second.act(seen).action)
+
+
+def test_a_tool_that_is_tilted_is_lifted(world) -> None:
+    expert, seen = WipeExpert(world.spec), dict(world.reset(np.random.default_rng(1)))
+    seen["ee_pos"] = seen["nearest_dirt_point"]
+    seen["ee_quat"] = np.array([0.0, 1.0, 0.0, 0.0])
+    assert expert.act(seen).action[2] < 0
+    seen["ee_quat"] = np.array([np.sin(0.2), np.cos(0.2), 0.0, 0.0])
+    assert expert.act(seen).action[2] == 1.0
+
+
+def test_speed_and_turn_are_drawn_within_the_style(world) -> None:
+    expert = WipeExpert(world.spec, ExpertStyle(speed=(0.5, 0.5), approach="any"))
+    seen, actions = world.reset(np.random.default_rng(3)), set()
+    for seed in range(20):
+        expert.reset(np.random.default_rng(seed))
+        action = expert.act(seen).action
+        assert np.abs(action).max() <= 0.5
+        actions.add(action.tobytes())
+    assert len(actions) == len(YAWS)
+
+
+def test_another_controller_is_refused(world) -> None:
+    with pytest.raises(InputError, match="the Wipe expert drives OSC_POSE, robot 'panda' has JOINT_POSITION"):
+        WipeExpert(replace(world.spec, controller="JOINT_POSITION"))
