@@ -120,8 +120,17 @@ def test_names_that_do_not_exist() -> None:
         make_config({"type": "bc_mlp", "loss": "nll"}, "test")
 
 
-def test_what_a_policy_does_in_a_world_depends_on_that_world_alone(thread, lift_world, tmp_path, rng) -> None:
-    """Memories and draws of two worlds, asked in turns, are those of each alone."""
+RNN = {"type": "bc_rnn", "n_obs_steps": 3, "lstm_units": 8, "head": "mixture", "loss": "nll", "sample": True}
+ACT = {"type": "act", "chunk_size": 3, "n_action_steps": 2, "dim_model": 16, "n_heads": 2, "dim_feedforward": 16}
+DIFFUSION = {
+    "type": "diffusion", "horizon": 8, "n_action_steps": 3, "drop_n_last_frames": 4, "down_dims": [8, 16],
+    "num_train_timesteps": 4, "n_groups": 4,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("table", [RNN, ACT, DIFFUSION], ids=lambda table: table["type"])
+def test_what_a_policy_does_in_a_world_depends_on_that_world_alone(thread, lift_world, tmp_path, rng, table) -> None:
+    """Memories and draws of two worlds, asked in turns, are those of each alone, also with LeRobot's policies."""
     import numpy as np
 
     from lfd.core.recipe import build, load_toml
@@ -131,7 +140,6 @@ def test_what_a_policy_does_in_a_world_depends_on_that_world_alone(thread, lift_
     from tests.conftest import BC
 
     tables = load_toml(BC, ("policy", "train", "eval"))
-    table = {"type": "bc_rnn", "n_obs_steps": 3, "lstm_units": 8, "head": "mixture", "loss": "nll", "sample": True}
     train(
         table, build(TrainRecipe, tables["train"] | {"steps": 2}, "test"), thread.dataset, tmp_path / "p", tables=tables
     )

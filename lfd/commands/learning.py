@@ -133,13 +133,17 @@ def _sweep(commands: Commands) -> None:
         "--vary", action="append", required=True, metavar="TABLE.KEY=[VALUE,VALUE]",
         help="values to try for a key of the recipe; may be repeated, all combinations are made",
     )  # fmt: skip
+    made.add_argument(
+        "--results", type=Path, metavar="PAGE.md", help="also write the table into a section of this page"
+    )
     cluster(made)
     output(made, "the policies and their evaluations")
 
 
 def run_sweep(given: Namespace) -> Result:
     """Policies for every combination of some values."""
-    from lfd.loops.sweep import sweep
+    from lfd.loops.results import write_section
+    from lfd.loops.sweep import rows_of, sweep, title_of
     from lfd.terminal import progress_bar
 
     with machines(given.cluster) as cluster:
@@ -152,6 +156,10 @@ def run_sweep(given: Namespace) -> Result:
             overwrite=given.overwrite,
             progress=progress_bar,
         )
+    if given.results is not None:
+        varied = " ".join(f"--vary {text}" for text in given.vary)
+        command = f"lfd sweep {given.recipe} --dataset {given.dataset} {varied}"
+        write_section(given.results, title_of(given.recipe, given.dataset), command, rows_of(rows))
     if given.json:
         return {"out": str(given.out), "rows": rows}
     best = {row.pop("folder"): ", ".join(f"{k} {short(v)}" for k, v in row.items()) for row in rows}

@@ -14,6 +14,7 @@ from lfd.replay.clip import clip_of
 from lfd.replay.rerun_scene import replay
 from lfd.replay.verify import verify_replay
 from lfd.run.evaluate import evaluate
+from lfd.run.judging import rollout_judge
 from lfd.run.trial import EvalRecipe
 from lfd.train.behavior_cloning import train
 from lfd.train.recipe import TrainRecipe
@@ -48,7 +49,9 @@ def demo(
     lap("record")
     converted = convert([recordings], dataset, **options)
     lap("convert")
-    trained = train(learn.get("policy", {}), recipes["train"], dataset, policy, tables=learn, **options)
+    tried, judged = recipes["eval"], recipes["train"].judge_episodes
+    judge = rollout_judge(tried, judged) if judged else None
+    trained = train(learn.get("policy", {}), recipes["train"], dataset, policy, tables=learn, judge=judge, **options)
     lap("train")
     report = evaluate(policy, recipes["eval"], run, **options)
     lap("eval")

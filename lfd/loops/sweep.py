@@ -1,18 +1,21 @@
 """Many policies from one dataset: every combination of some values of a policy recipe, trained and evaluated."""
 
+import time
 from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lfd.core.artifact import check_output, packed, sha256, unpack, write_json, write_manifest
+from lfd.core.artifact import check_output, packed, read_manifest, sha256, unpack, write_json, write_manifest
 from lfd.core.errors import RecipeError
 from lfd.core.protocols import Progress, UnitMap, silent
 from lfd.core.recipe import build, load_toml
 from lfd.data.frames import load_frames
 from lfd.run.evaluate import REPORT, evaluate
+from lfd.run.judging import rollout_judge
 from lfd.run.trial import EvalRecipe
+from lfd.run.wilson import wilson_interval
 from lfd.train.behavior_cloning import train
 from lfd.train.recipe import TrainRecipe
 from lfd.worlds.robosuite_world import EVERY_CORE
@@ -89,6 +92,28 @@ def sweep(
     return rows
 
 
+def title_of(recipe: Path, dataset: Path) -> str:
+    """What a sweep is about, as the title of its results."""
+    about = read_manifest(dataset) or {}
+    return f"Policies: {recipe.stem} on {about.get('task')} with {about.get('robot')}"
+
+
+def rows_of(rows: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """A sweep's rows as lines of a table, and all of their episodes together."""
+    told = {}
+    for row in rows:
+        chosen = ", ".join(f"{key} {value}" for key, value in row.items() if "." in key)
+        low, high = row["interval"]
+        told[chosen] = (
+            f"{row['success_rate']:.1%} of {row['episodes']} ({low:.1%} to {high:.1%}), "
+            f"{row['mean_steps']:.0f} control steps, trained in {row['train_seconds']:.0f} s"
+        )
+    episodes = sum(row["episodes"] for row in rows)
+    solved = sum(round(row["success_rate"] * row["episodes"]) for row in rows)
+    low, high = wilson_interval(solved, episodes)
+    return {**told, "together": f"{solved / episodes:.1%} of {episodes} ({low:.1%} to {high:.1%})"}
+
+
 def _unit(dataset: Mapping[str, bytes], tables: Tables) -> tuple[dict[str, bytes], dict[str, Any]]:
     """A worker's part of a sweep: one policy and its evaluation."""
     with TemporaryDirectory() as folder:
@@ -102,7 +127,10 @@ def _make(dataset: Path, tables: Tables, most_worlds: int) -> tuple[dict[str, by
     tried = build(EvalRecipe, tables.get("eval", {}), "[eval]")
     with TemporaryDirectory() as folder:
         policy, run = Path(folder) / "policy", Path(folder) / "run"
-        trained = train(dict(tables.get("policy", {})), recipe, dataset, policy, tables=tables)
+        began = time.perf_counter()
+        judge = rollout_judge(tried, recipe.judge_episodes, most_worlds=most_worlds) if recipe.judge_episodes else None
+        trained = train(dict(tables.get("policy", {})), recipe, dataset, policy, tables=tables, judge=judge)
+        seconds = time.perf_counter() - began
         report = evaluate(policy, tried, run, most_worlds=most_worlds)
         measured = {
             "success_rate": report.success_rate,
@@ -110,5 +138,6 @@ def _make(dataset: Path, tables: Tables, most_worlds: int) -> tuple[dict[str, by
             "episodes": report.episodes,
             "mean_steps": report.mean_steps,
             "loss": trained.loss,
+            "train_seconds": round(seconds, 1),
         }
         return packed(Path(folder)), measured

@@ -46,7 +46,11 @@ TASKS: dict[str, Task] = {
             points={"handle": "Door_handle"},
         ),
         Task("Wipe", "wipe the dirt off the table"),
-        Task("ToolHang", "put the hook into its stand and hang the tool on it"),
+        Task(
+            "ToolHang",
+            "put the hook into its stand and hang the tool on it",
+            points={"tip": "frame_tip_site", "hook": "frame_hang_site", "ring": "tool_hole1_center"},
+        ),
         Task(
             "TwoArmLift",
             "lift the pot by its two handles",

@@ -1,0 +1,293 @@
+"""The scripted expert for ToolHang.
+
+A state-feedback policy: which of its moves it makes is read from the present observation alone.
+
+    hung       the tool's ring is on the hook             -> open, then back
+    hang       the frame stands, the tool is held         -> the ring over the hook's post, down, and let the tool tip
+    leave      the frame stands, the hand is still at it  -> open, then back
+    fetch      the frame stands                           -> over the stand to the tool, open; close around its grip
+    insert     the frame is held                          -> upright, its tip over the mount and down into it
+    grasp      otherwise                                  -> down onto the frame's grip, open; close around it
+
+The frame lies on the table with its rod level, so that the hand which grasps it from above points sideways when the
+rod is upright: to the robot's right, where the arm has most room. The hook then points away from the robot.
+
+The hook ends in a post, as high as the ring is wide: the ring passes only while it is tilted. It comes down over the
+post with the tool nearly level and tilts on the way, down to `TILT_RAD[0]`, from where the tool swings into place by
+itself when it is let go.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lfd.core.protocols import Decision, Observation, WorldSpec
+from lfd.core.rotations import matrix_from_wxyz, rotvec_between
+from lfd.experts.grippers import gripper_of
+from lfd.experts.reaching import CLOSE, OPEN, Hand, check_controller, funnel, towards
+from lfd.experts.style import PLAIN, ExpertStyle
+
+FRAME_GRIP = np.array([0.04375, 0.0, 0.0525])
+"""Middle of the frame's grip, in the frame's axes [m]."""
+GRIPS_M = (0.0, 0.012, -0.012)
+"""Where along a grip it is held [m]."""
+R_FRAME_HAND = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""The hand that holds the frame: its fingers point along the frame's y axis, the rod's tip along the hand's y axis."""
+LEAN_RAD = 0.5
+"""How far the hand that holds the tool leans towards the ring, so that it leans less when the tool tilts [rad]."""
+R_TOOL_HAND = np.array(
+    [
+        [0.0, -np.cos(LEAN_RAD), np.sin(LEAN_RAD)],
+        [-1.0, 0.0, 0.0],
+        [0.0, -np.sin(LEAN_RAD), -np.cos(LEAN_RAD)],
+    ]
+)
+"""The hand that holds the tool: but for the lean, the ring is along the hand's y axis, seen from the handle."""
+MOUNT = np.array([0.0, 0.045, 0.080])
+"""Top of the mount, in the stand's axes [m]."""
+BOTTOM_M = 0.149
+"""Depth of the mount [m]."""
+HOVER_M = 0.08
+"""Distance from a grip at which the hand is brought before it [m]."""
+FUNNEL_M, TWIST_RAD = (0.008, 0.030), (0.15, 0.50)
+"""Distance and angle beside a grip below which the hand goes all the way, and above which it hovers."""
+ACROSS_M, AROUND_M, AROUND_RAD = 0.018, 0.010, 0.20
+"""How far a grip may be from the middle of the fingers, along their way and across it, and the angle."""
+HELD_M = 0.025
+"""How far a grip may have slipped while it is held [m]."""
+FRAME_WIDTH_M, TOOL_WIDTH_M = (0.018, 0.0275), (0.0275, 0.036)
+"""Opening of the fingers when they hold the frame's grip, of 0.0254 m, and the tool's, of 0.030 m [m]."""
+OPENED_M = (0.036, 0.055)
+"""Opening of the fingers between which the hand begins to leave [m]."""
+CLEAR_M = 0.03
+"""Height above the mount at which the frame's tip is brought over it [m]."""
+OVER_M, INSIDE_M = (0.002, 0.008), 0.007
+"""Distance of the tip from the mount's axis below which it goes down, above which it stays high, and below which a tip
+lower than the top is inside [m]."""
+UPRIGHT_RAD = (0.06, 0.25)
+"""Angle of the frame from upright below which it goes down, and above which it stays high [rad]."""
+SINK_M = 0.012
+"""How far ahead the tip is sent down inside the mount [m]."""
+STANDS_M = 0.012
+"""Height of the tip above the mount's bottom below which the frame stands; robosuite asks for 0.017 [m]."""
+BESIDE_M = (0.08, 0.16)
+"""Horizontal distance from the stand, or from the hook, below which what moves there has to be above it [m]."""
+ROUND_STAND_M = (0.14, 0.20)
+"""Distance from the frame in its stand up to which the open hand passes over it, and from which it need not [m]."""
+OVER_STAND_M, DROP_M = 0.19, 0.5
+"""Height above the mount's top at which it does so, and how much of it goes with the distance [m]."""
+LEAVE_M = 0.10
+"""How far the hand goes straight back from a grip that it let go [m]."""
+HIGH_M = 0.05
+"""Height of the ring above the hook at which it is brought over it [m]."""
+TILT_RAD = (0.72, 1.22)
+"""Angle of the tool from hanging when the ring is around the bar, and above the post [rad]."""
+TILTING_M = (0.002, 0.014)
+"""Height of the ring above the bar between which the tool tilts [m]."""
+RING_M = 0.0045
+"""Distance of the ring's middle from the end of the bar [m]."""
+POST_M = (0.0015, 0.006)
+"""Distance of the ring from there, below which it goes down over the post, and above which it stays high [m]."""
+TURN_RAD = 0.25
+"""How far the hand is asked to turn at a time [rad]; when it turns faster, the arm swings aside."""
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a thing is in the world frame."""
+
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True)
+class Move:
+    """Where the hand is to go, and what the gripper does."""
+
+    position: Float[np.ndarray, "3"]
+    rotation: Float[np.ndarray, "3 3"]
+    gripper: float
+
+
+class ToolHangExpert:
+    """Puts the frame into the stand and hangs the tool on it with an OSC_POSE arm.
+
+    Raises `InputError` for a world whose action is not OSC_POSE with a gripper.
+    """
+
+    name = "tool_hang_expert"
+
+    def __init__(self, spec: WorldSpec, style: ExpertStyle = PLAIN):
+        check_controller(spec, "ToolHang")
+        self._style, self._gripper = style, gripper_of(spec)
+        self._speed, self._along = style.speed[1], GRIPS_M[0]
+
+    def reset(self, rng: np.random.Generator) -> None:
+        """Draw the speed of the episode, and where along their grips things are held."""
+        self._speed = self._style.draw_speed(rng)
+        self._along = GRIPS_M[self._style.draw_grasp(rng, len(GRIPS_M)) or 0]
+
+    def act(self, observation: Observation) -> Decision:
+        hand = Hand.of(observation)
+        move = self._move(observation, hand)
+        action = towards(hand, move.position, move.rotation, move.gripper, speed=self._speed)
+        return Decision(action, expert_action=action)
+
+    def _move(self, observation: Observation, hand: Hand) -> Move:
+        frame, tool, stand = (
+            Pose(observation[f"{name}_pos"], matrix_from_wxyz(observation[f"{name}_quat"]))
+            for name in ("frame", "tool", "stand")
+        )
+        top = stand.position + stand.rotation @ MOUNT
+        held_at = frame.position + frame.rotation @ (FRAME_GRIP + self._along * UP)
+        frame_grip = Pose(held_at, frame.rotation @ R_FRAME_HAND)
+        tip = observation["tip_point"]
+        if not stands(tip - top):
+            if self._holds(observation, hand, frame_grip, FRAME_WIDTH_M):
+                return insert(hand, frame, tip, top)
+            return self._grasp(hand, frame_grip)
+        ring = Pose(observation["ring_point"], tool.rotation)
+        tool_grip = Pose(tool.position + self._along * tool.rotation[:, 0], tool_hand(tool.rotation))
+        placed = about_hook(ring, observation["hook_point"], frame)
+        if placed.is_hung:
+            return self._leave(observation, hand)
+        if self._holds(observation, hand, tool_grip, TOOL_WIDTH_M):
+            return hang(hand, ring, placed, frame)
+        if is_at(hand, frame_grip):
+            return self._leave(observation, hand)
+        return over_stand(hand, self._grasp(hand, tool_grip), top, observation["hook_point"])
+
+    def _holds(self, observation: Observation, hand: Hand, grip: Pose, width: tuple[float, float]) -> bool:
+        opening = self._gripper.opening(observation)
+        near = float(np.linalg.norm(hand.position - grip.position)) < HELD_M
+        return near and width[0] < opening < width[1] and self._gripper.has_stopped(observation)
+
+    def _grasp(self, hand: Hand, grip: Pose) -> Move:
+        """Towards a grip along the hand's axis, from before it; around it, close."""
+        away = grip.rotation.T @ (hand.position - grip.position)
+        twist = float(np.linalg.norm(rotvec_between(hand.rotation, grip.rotation)))
+        off = max(funnel(float(np.hypot(away[0], away[1])), *FUNNEL_M), funnel(twist, *TWIST_RAD))
+        around = abs(away[0]) < ACROSS_M and max(abs(away[1]), abs(away[2])) < AROUND_M and twist < AROUND_RAD
+        position = grip.position - HOVER_M * off * grip.rotation[:, 2]
+        return Move(position, slowly(hand.rotation, grip.rotation), CLOSE if around else OPEN)
+
+    def _leave(self, observation: Observation, hand: Hand) -> Move:
+        """Open, then straight back along the fingers."""
+        back = LEAVE_M * funnel(self._gripper.opening(observation), *OPENED_M)
+        return Move(hand.position - back * hand.rotation[:, 2], hand.rotation, OPEN)
+
+
+def stands(tip: Float[np.ndarray, "3"]) -> bool:
+    """Whether the frame stands in the mount, from its tip relative to the mount's top."""
+    return float(np.hypot(tip[0], tip[1])) < INSIDE_M and float(tip[2]) < STANDS_M - BOTTOM_M
+
+
+def insert(hand: Hand, frame: Pose, tip: Float[np.ndarray, "3"], top: Float[np.ndarray, "3"]) -> Move:
+    """Bring the frame's tip over the mount with the frame upright, and down into it."""
+    ahead = np.array([0.0, -1.0, 0.0])
+    goal = np.column_stack([np.cross(ahead, UP), ahead, UP])
+    aside, height = float(np.hypot(*(tip - top)[:2])), float(tip[2] - top[2])
+    tilt = float(np.arccos(min(frame.rotation[2, 2], 1.0)))
+    off = max(funnel(aside, *OVER_M), funnel(tilt, *UPRIGHT_RAD))
+    if height < 0 and aside < INSIDE_M:
+        off = 0.0
+    free = max(funnel(height, CLEAR_M - 0.020, CLEAR_M - 0.010), funnel(aside, *BESIDE_M), 1.0 - off)
+    down = max(CLEAR_M * off - (BOTTOM_M + SINK_M) * (1.0 - off) - height, -SINK_M - 0.03 * off)
+    target = tip + np.array([*(free * (top - tip)[:2]), down])
+    return placing(hand, Pose(tip, frame.rotation), Pose(target, goal))
+
+
+def placing(hand: Hand, held: Pose, goal: Pose) -> Move:
+    """The move of the hand that brings what it holds to a pose, turning slowly: T_hand = T_goal T_held^-1 T_hand."""
+    turned = slowly(held.rotation, goal.rotation) @ held.rotation.T
+    return Move(goal.position + turned @ (hand.position - held.position), turned @ hand.rotation, CLOSE)
+
+
+def slowly(rotation: Float[np.ndarray, "3 3"], goal: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation at most `TURN_RAD` on the way from one to another."""
+    turn = rotvec_between(rotation, goal)
+    angle = float(np.linalg.norm(turn))
+    if angle <= TURN_RAD:
+        return goal
+    half = 0.5 * TURN_RAD
+    return matrix_from_wxyz(np.array([np.cos(half), *(np.sin(half) / angle * turn)])) @ rotation
+
+
+def tool_hand(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """The hand that grasps the tool from above, whichever side of it is up."""
+    upside = np.array([1.0, -1.0, -1.0]) if rotation[2, 2] < 0 else np.ones(3)
+    return (rotation * upside) @ R_TOOL_HAND
+
+
+def is_at(hand: Hand, grip: Pose) -> bool:
+    """Whether the hand is still around a grip, or before it closer than it goes back."""
+    away = grip.rotation.T @ (hand.position - grip.position)
+    return float(np.hypot(away[0], away[1])) < 0.05 and -LEAVE_M < float(away[2]) < 0.03
+
+
+def over_stand(hand: Hand, move: Move, top: Float[np.ndarray, "3"], hook: Float[np.ndarray, "3"]) -> Move:
+    """The same move, but over the frame in its stand rather than through it: up first, then turned, then across."""
+    beside = beside_segment(hand.position[:2], top[:2], hook[:2])
+    lacking = float(top[2]) + OVER_STAND_M - DROP_M * funnel(beside, *ROUND_STAND_M) - float(hand.position[2])
+    twist = float(np.linalg.norm(rotvec_between(hand.rotation, move.rotation)))
+    near = 1.0 - funnel(beside, *ROUND_STAND_M)
+    free = 1.0 - max(funnel(lacking, 0.005, 0.03), near * funnel(twist, 0.05, TURN_RAD - 0.05))
+    way = free * (move.position - hand.position)
+    return Move(
+        hand.position + np.array([way[0], way[1], max(move.position[2] - hand.position[2], lacking)]),
+        move.rotation,
+        move.gripper,
+    )
+
+
+def beside_segment(point: Float[np.ndarray, "2"], begin: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
+    """Distance of a point from a line segment."""
+    along = end - begin
+    share = min(max(float((point - begin) @ along) / float(along @ along), 0.0), 1.0)
+    return float(np.linalg.norm(point - begin - share * along))
+
+
+@dataclass(frozen=True)
+class AboutHook:
+    """The ring as the hook sees it."""
+
+    inward: float
+    """From the end of the bar along it [m]."""
+    aside: float
+    """Beside the bar [m]."""
+    height: float
+    """Above the bar [m]."""
+    tilt: float
+    """Angle of the tool from hanging [rad]."""
+
+    @property
+    def is_hung(self) -> bool:
+        """Whether the tool hangs, or would swing into place when it is let go."""
+        around = abs(self.aside) < 0.006 and -0.012 < self.height < 0.005
+        return around and 0.001 < self.inward < 0.085 and self.tilt < TILT_RAD[0] + 0.15
+
+
+def about_hook(ring: Pose, hook: Float[np.ndarray, "3"], frame: Pose) -> AboutHook:
+    """Where the ring is about the hook of a frame."""
+    inward, aside, height = frame.rotation.T @ (ring.position - hook)
+    handle = frame.rotation.T @ ring.rotation[:, 0]
+    return AboutHook(float(inward), float(aside), float(height), float(np.arctan2(-handle[0], -handle[2])))
+
+
+def hang(hand: Hand, ring: Pose, placed: AboutHook, frame: Pose) -> Move:
+    """Bring the ring over the hook's post with the handle pointing away from the stand, and down around the bar."""
+    away = float(np.hypot(placed.inward - RING_M, placed.aside))
+    tilt = TILT_RAD[0] + (TILT_RAD[1] - TILT_RAD[0]) * funnel(placed.height, *TILTING_M)
+    handle = -np.sin(tilt) * frame.rotation[:, 0] - np.cos(tilt) * frame.rotation[:, 2]
+    face = np.cos(tilt) * frame.rotation[:, 0] - np.sin(tilt) * frame.rotation[:, 2]
+    face = face * np.copysign(1.0, face @ ring.rotation[:, 2])
+    goal = np.column_stack([handle, np.cross(face, handle), face])
+    twist = float(np.linalg.norm(rotvec_between(ring.rotation, goal)))
+    off = max(funnel(away, *POST_M), funnel(twist, 0.15, 0.5)) * funnel(placed.height, 0.008, 0.014)
+    free = max(funnel(away, *BESIDE_M), funnel(placed.height, HIGH_M - 0.025, HIGH_M - 0.010), 1.0 - off)
+    wanted = np.array([RING_M, 0.0, HIGH_M * off])
+    step = wanted - np.array([placed.inward, placed.aside, placed.height])
+    step = np.array([free * step[0], free * step[1], max(step[2], -0.02)])
+    return placing(hand, ring, Pose(ring.position + frame.rotation @ step, goal))
