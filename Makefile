@@ -25,6 +25,10 @@ results: $(READY)
 	$(BIN)/lfd bench cameras --results docs/results.md
 	$(BIN)/lfd bench record --results docs/results.md
 	$(BIN)/lfd bench convert --results docs/results.md
+	$(BIN)/lfd bench train --results docs/results.md
+	$(BIN)/lfd bench compounding --results docs/results.md
+	$(BIN)/lfd bench dagger --results docs/results.md
+	$(BIN)/lfd experts --episodes 50 --results docs/results.md
 
 pictures: $(READY)
 	$(BIN)/python docs/make_pictures.py

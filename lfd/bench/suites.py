@@ -130,6 +130,33 @@ def _train(given: Namespace) -> tuple[Measured, Measured]:
     return measured, {"Training: loading in batches of 64": loading, "Training: behaviour cloning": steps}
 
 
+def _compounding(given: Namespace) -> tuple[Measured, Measured]:
+    from pathlib import Path
+
+    from lfd.bench.compounding import bench_compounding, plot, rows_of
+    from lfd.bench.stretched_lift import Setting
+
+    lift = Setting(
+        robot=given.robot,
+        control_hz=20,
+        demonstrations=4 if given.quick else 20,
+        episodes=4 if given.quick else 20,
+        gradient_steps=300 if given.quick else 2000,
+    )
+    measured = bench_compounding(
+        epsilon=1e-4,
+        horizons=(10, 20, 50, 100, 200, 500, 1000),
+        rounds=2,
+        lift=lift,
+        speeds=(1.0, 0.5) if given.quick else (1.0, 0.5, 0.25),
+        seeds=range(given.seed, given.seed + (1 if given.quick else 3)),
+        progress=progress_bar,
+    )
+    if given.results is not None:
+        plot(measured, Path("docs/pictures/compounding.png"))
+    return asdict(measured), {"Compounding error": rows_of(measured)}
+
+
 def _dagger(given: Namespace) -> tuple[Measured, Measured]:
     from pathlib import Path
 
@@ -148,6 +175,7 @@ SUITES: dict[str, Suite] = {
     "record": _record,
     "convert": _convert,
     "train": _train,
+    "compounding": _compounding,
     "dagger": _dagger,
 }
 """Name to suite."""

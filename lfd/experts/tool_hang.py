@@ -71,8 +71,8 @@ SINK_M = 0.012
 """How far ahead the tip is sent down inside the mount [m]."""
 STANDS_M = 0.012
 """Height of the tip above the mount's bottom below which the frame stands; robosuite asks for 0.017 [m]."""
-BESIDE_M = (0.08, 0.16)
-"""Horizontal distance from the stand, or from the hook, below which what moves there has to be above it [m]."""
+BESIDE_M, BESIDE_HOOK_M = (0.08, 0.16), (0.16, 0.24)
+"""Horizontal distance from the mount, and from the hook, below which what moves there has to be above it [m]."""
 ROUND_STAND_M = (0.14, 0.20)
 """Distance from the frame in its stand up to which the open hand passes over it, and from which it need not [m]."""
 OVER_STAND_M, DROP_M = 0.19, 0.5
@@ -230,16 +230,15 @@ def is_at(hand: Hand, grip: Pose) -> bool:
 def over_stand(hand: Hand, move: Move, top: Float[np.ndarray, "3"], hook: Float[np.ndarray, "3"]) -> Move:
     """The same move, but over the frame in its stand rather than through it: up first, then turned, then across."""
     beside = beside_segment(hand.position[:2], top[:2], hook[:2])
-    lacking = float(top[2]) + OVER_STAND_M - DROP_M * funnel(beside, *ROUND_STAND_M) - float(hand.position[2])
+    way = move.position - hand.position
+    away = float(np.hypot(way[0], way[1]))
+    low = max(funnel(beside, *ROUND_STAND_M), 1.0 - funnel(away, *FUNNEL_M))
+    lacking = float(top[2]) + OVER_STAND_M - DROP_M * low - float(hand.position[2])
     twist = float(np.linalg.norm(rotvec_between(hand.rotation, move.rotation)))
     near = 1.0 - funnel(beside, *ROUND_STAND_M)
     free = 1.0 - max(funnel(lacking, 0.005, 0.03), near * funnel(twist, 0.05, TURN_RAD - 0.05))
-    way = free * (move.position - hand.position)
-    return Move(
-        hand.position + np.array([way[0], way[1], max(move.position[2] - hand.position[2], lacking)]),
-        move.rotation,
-        move.gripper,
-    )
+    step = np.array([free * way[0], free * way[1], max(float(way[2]), lacking)])
+    return Move(hand.position + step, move.rotation, move.gripper)
 
 
 def beside_segment(point: Float[np.ndarray, "2"], begin: Float[np.ndarray, "2"], end: Float[np.ndarray, "2"]) -> float:
@@ -286,7 +285,7 @@ def hang(hand: Hand, ring: Pose, placed: AboutHook, frame: Pose) -> Move:
     goal = np.column_stack([handle, np.cross(face, handle), face])
     twist = float(np.linalg.norm(rotvec_between(ring.rotation, goal)))
     off = max(funnel(away, *POST_M), funnel(twist, 0.15, 0.5)) * funnel(placed.height, 0.008, 0.014)
-    free = max(funnel(away, *BESIDE_M), funnel(placed.height, HIGH_M - 0.025, HIGH_M - 0.010), 1.0 - off)
+    free = max(funnel(away, *BESIDE_HOOK_M), funnel(placed.height, HIGH_M - 0.025, HIGH_M - 0.010), 1.0 - off)
     wanted = np.array([RING_M, 0.0, HIGH_M * off])
     step = wanted - np.array([placed.inward, placed.aside, placed.height])
     step = np.array([free * step[0], free * step[1], max(step[2], -0.02)])
