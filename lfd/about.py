@@ -61,10 +61,11 @@ def _about_recipe(path: Path) -> dict[str, Any]:
     from lfd.record.demonstrations import RecordRecipe
     from lfd.run.trial import EvalRecipe
     from lfd.train.recipe import TrainRecipe
-    from lfd.worlds.robots import RobotConfig, TeleopConfig
+    from lfd.worlds.robots import RobotConfig, RobotModel, TeleopConfig
 
     kinds: dict[str, type] = {
         "robot": RobotConfig,
+        "model": RobotModel,
         "teleop": TeleopConfig,
         "record": RecordRecipe,
         "convert": ConvertRecipe,

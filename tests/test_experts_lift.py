@@ -51,7 +51,10 @@ def test_the_same_observation_gives_the_same_action(lift_world) -> None:
 
 
 def test_noise_is_applied_and_the_label_stays_clean(lift_world) -> None:
-    expert, noisy = make_expert(lift_world.spec), NoisyPolicy(make_expert(lift_world.spec), scale=0.3)
+    expert, noisy = (
+        make_expert(lift_world.spec),
+        NoisyPolicy(make_expert(lift_world.spec), lift_world.spec.labels["action"], scale=0.3),
+    )
     seen = lift_world.reset(np.random.default_rng(1))
     noisy.reset(np.random.default_rng(2))
     meant = expert.act(seen).action

@@ -81,7 +81,7 @@ def test_it_recovers_from_a_nut_put_elsewhere(world, at) -> None:
 @pytest.mark.slow
 def test_every_speed_and_grasp_succeeds_under_noise(world) -> None:
     expert = NutAssemblySquareExpert(world.spec, ExpertStyle(speed=(0.6, 1.0), approach="any"))
-    assert successes(world, NoisyPolicy(expert, scale=0.1), 44, 30, 400) >= 29
+    assert successes(world, NoisyPolicy(expert, world.spec.labels["action"], scale=0.1), 44, 30, 400) >= 29
 
 
 @pytest.mark.slow

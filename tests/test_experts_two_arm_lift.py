@@ -53,7 +53,7 @@ def test_two_arm_lift_succeeds_from_at_least_98_percent_of_200_starts(world) -> 
 @pytest.mark.slow
 def test_it_succeeds_with_noise_at_every_speed_and_with_every_grasp(world) -> None:
     expert = TwoArmLiftExpert(world.spec, ExpertStyle(speed=(0.6, 1.0), approach="any"))
-    assert successes(world, NoisyPolicy(expert, scale=0.1), 43, 40) >= 38
+    assert successes(world, NoisyPolicy(expert, world.spec.labels["action"], scale=0.1), 43, 40) >= 38
 
 
 def test_the_expert_recovers_from_pushes(world) -> None:

@@ -52,7 +52,7 @@ def test_wipe_succeeds_from_at_least_98_percent_of_200_starts(world) -> None:
 @pytest.mark.slow
 def test_it_succeeds_with_noise_at_every_speed_and_with_the_tool_either_way(world) -> None:
     expert = WipeExpert(world.spec, ExpertStyle(speed=(0.6, 1.0), approach="any"))
-    assert successes(world, NoisyPolicy(expert, scale=0.1), 43, 20) >= 18
+    assert successes(world, NoisyPolicy(expert, world.spec.labels["action"], scale=0.1), 43, 20) >= 18
 
 
 @pytest.mark.slow

@@ -89,7 +89,7 @@ def test_what_the_learner_does_is_independent_of_the_coin() -> None:
 
 
 def test_the_label_of_a_noisy_expert_is_what_it_meant() -> None:
-    noisy = NoisyPolicy(PointExpert(), scale=0.5)
+    noisy = NoisyPolicy(PointExpert(), ("x", "y"), scale=0.5)
     policy = MixturePolicy(OneEach([noisy]), OneEach([PointLearner()]), 1.0, per="step")
     policy.reset(0, np.random.default_rng(3))
     (decision,) = policy.act([0], [{"position": np.array([0.03, -0.02])}])

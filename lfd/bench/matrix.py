@@ -108,7 +108,7 @@ def success_rates(
     with progress("success on both steppers", 2 * episodes) as bar:
         for stepper in ("compiled", "robosuite"):
             world = make_world(task, robot, control_hz, stepper)
-            policy, successes = NoisyPolicy(make_expert(world.spec), scale=0.3), 0
+            policy, successes = NoisyPolicy(make_expert(world.spec), world.spec.labels["action"], scale=0.3), 0
             for episode in range(episodes):
                 rng = episode_rng("eval", seed, episode)
                 outcome = rollout(world, policy, [], rng, horizon=round(2.5 * control_hz), hold_steps=control_hz // 4)

@@ -4,6 +4,8 @@ The noise is injected into what is applied, the demonstrator's own action is kep
 et al. 2017, "DART: Noise Injection for Robust Imitation Learning").
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lfd.core.protocols import Decision, Observation, Policy
@@ -14,12 +16,12 @@ class NoisyPolicy:
 
     The noise is a first-order autoregressive process with standard deviation `scale` (in units of the
     action) and correlation `persistence` from step to step, so that it pushes the arm off its way instead of
-    shaking it. The last component, the gripper's, is left alone.
+    shaking it. Grippers are left alone: `names` are those of the action's components.
     """
 
-    def __init__(self, policy: Policy, *, scale: float, persistence: float = 0.8):
+    def __init__(self, policy: Policy, names: Sequence[str], *, scale: float, persistence: float = 0.8):
         self.name = policy.name
-        self._policy = policy
+        self._policy, self._shaken = policy, [i for i, name in enumerate(names) if not name.endswith("gripper")]
         self._scale, self._persistence = scale, persistence
 
     def reset(self, rng: np.random.Generator) -> None:
@@ -29,8 +31,9 @@ class NoisyPolicy:
 
     def act(self, observation: Observation) -> Decision:
         meant = self._policy.act(observation).action
-        fresh = self._rng.normal(scale=self._scale, size=len(meant) - 1)
+        fresh = self._rng.normal(scale=self._scale, size=len(self._shaken))
         keep = self._persistence
         self._noise = keep * self._noise + np.sqrt(1 - keep**2) * fresh
-        applied = meant + np.append(self._noise, 0.0)
+        applied = meant.copy()
+        applied[self._shaken] += self._noise
         return Decision(np.clip(applied, -1.0, 1.0), expert_action=meant)

@@ -9,6 +9,9 @@ A state-feedback policy: which of its moves it makes is read from the present ob
 
 The can is round: the gripper keeps to the axes of the world, whatever the can's yaw is. It turns only where it has
 to: by the walls, along them; and across a can that has fallen over.
+
+Over the far bin a Panda's arm is nearly stretched. When the can is put back into the first bin at that moment, the
+elbow may come to its limit on the way there, which OSC does not leave again.
 """
 
 import numpy as np
@@ -30,10 +33,8 @@ from lfd.experts.reaching import (
 )
 from lfd.experts.style import PLAIN, ExpertStyle
 
-BIN_LOW, BIN_HIGH = np.array([0.10, 0.28]), np.array([0.30, 0.53])
-"""The can's compartment [m], as robosuite judges it; it is the same in every episode."""
-INSIDE_M = 0.030
-"""Way from the compartment's bounds at which the can is in it [m]."""
+INSIDE_LOW, INSIDE_HIGH = np.array([0.13, 0.31]), np.array([0.27, 0.50])
+"""Where the can is in its compartment [m]: 0.03 m within the bounds of robosuite, the same in every episode."""
 DROP = np.array([0.155, 0.345])
 """Where the can is let go [m]: nearer than the compartment's centre, where a Panda's elbow comes to its limit."""
 BIN_CENTRE, BIN_HALF = np.array([0.10, -0.25]), np.array([0.19, 0.24])
@@ -101,10 +102,7 @@ class PickPlaceCanExpert:
         sideways = float(np.hypot(away[0], away[1]))
         width = self._gripper.opening(observation)
         closed_on_it = HELD_WIDTH_M[0] < width < HELD_WIDTH_M[1] and self._gripper.has_stopped(observation)
-        if (
-            can[2] < LET_GO_M
-            and (np.abs(can[:2] - (BIN_LOW + BIN_HIGH) / 2) < (BIN_HIGH - BIN_LOW) / 2 - INSIDE_M).all()
-        ):
+        if can[2] < LET_GO_M and (INSIDE_LOW < can[:2]).all() and (can[:2] < INSIDE_HIGH).all():
             target, gripper = above(hand.position, AWAY_M * funnel(width, *FREE_M)), OPEN
         elif closed_on_it and np.linalg.norm(away) < SLIPPED_M:
             target, gripper = hand.position + _carried(can) - can, self._gripper.hold

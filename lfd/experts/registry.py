@@ -14,6 +14,7 @@ from lfd.experts.pick_place_can import PickPlaceCanExpert
 from lfd.experts.stack import StackExpert
 from lfd.experts.style import PLAIN, ExpertStyle
 from lfd.experts.two_arm_lift import TwoArmLiftExpert
+from lfd.experts.wipe import WipeExpert
 
 EXPERTS: dict[str, Callable[[WorldSpec, ExpertStyle], Policy]] = {
     "Door": DoorExpert,
@@ -22,6 +23,7 @@ EXPERTS: dict[str, Callable[[WorldSpec, ExpertStyle], Policy]] = {
     "PickPlaceCan": PickPlaceCanExpert,
     "Stack": StackExpert,
     "TwoArmLift": TwoArmLiftExpert,
+    "Wipe": WipeExpert,
 }
 
 

@@ -79,6 +79,8 @@ OVER_STAND_M, DROP_M = 0.19, 0.5
 """Height above the mount's top at which it does so, and how much of it goes with the distance [m]."""
 LEAVE_M = 0.10
 """How far the hand goes straight back from a grip that it let go [m]."""
+AWAY_M = (0.25, 0.30)
+"""Distance from the hook at which the hand comes to rest when all is done [m]."""
 HIGH_M = 0.05
 """Height of the ring above the hook at which it is brought over it [m]."""
 TILT_RAD = (0.72, 1.22)
@@ -89,6 +91,8 @@ RING_M = 0.0045
 """Distance of the ring's middle from the end of the bar [m]."""
 POST_M = (0.0015, 0.006)
 """Distance of the ring from there, below which it goes down over the post, and above which it stays high [m]."""
+THREADED_M = (0.006, 0.009)
+"""The same for a ring as low as the post, between being around it and being beside it [m]."""
 TURN_RAD = 0.25
 """How far the hand is asked to turn at a time [rad]; when it turns faster, the arm swings aside."""
 UP = np.array([0.0, 0.0, 1.0])
@@ -174,8 +178,9 @@ class ToolHangExpert:
         return Move(position, slowly(hand.rotation, grip.rotation), CLOSE if around else OPEN)
 
     def _leave(self, observation: Observation, hand: Hand) -> Move:
-        """Open, then straight back along the fingers."""
-        back = LEAVE_M * funnel(self._gripper.opening(observation), *OPENED_M)
+        """Open, then straight back along the fingers, to some distance from the hook."""
+        far = funnel(float(np.linalg.norm(hand.position - observation["hook_point"])), *AWAY_M)
+        back = LEAVE_M * funnel(self._gripper.opening(observation), *OPENED_M) * (1.0 - far)
         return Move(hand.position - back * hand.rotation[:, 2], hand.rotation, OPEN)
 
 
@@ -284,7 +289,8 @@ def hang(hand: Hand, ring: Pose, placed: AboutHook, frame: Pose) -> Move:
     face = face * np.copysign(1.0, face @ ring.rotation[:, 2])
     goal = np.column_stack([handle, np.cross(face, handle), face])
     twist = float(np.linalg.norm(rotvec_between(ring.rotation, goal)))
-    off = max(funnel(away, *POST_M), funnel(twist, 0.15, 0.5)) * funnel(placed.height, 0.008, 0.014)
+    threaded = (1.0 - funnel(away, *THREADED_M)) * (1.0 - funnel(placed.height, *TILTING_M))
+    off = max(funnel(away, *POST_M), funnel(twist, *TWIST_RAD)) * (1.0 - threaded)
     free = max(funnel(away, *BESIDE_HOOK_M), funnel(placed.height, HIGH_M - 0.025, HIGH_M - 0.010), 1.0 - off)
     wanted = np.array([RING_M, 0.0, HIGH_M * off])
     step = wanted - np.array([placed.inward, placed.aside, placed.height])

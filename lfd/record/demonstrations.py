@@ -288,4 +288,8 @@ def take_cameras(world: RobosuiteWorld, recipe: RecordRecipe) -> None:
 
 def _demonstrator(world: World, recipe: RecordRecipe) -> Policy:
     expert = make_expert(world.spec, recipe.style)
-    return NoisyPolicy(expert, scale=recipe.action_noise) if recipe.action_noise > 0 else expert
+    return (
+        NoisyPolicy(expert, world.spec.labels["action"], scale=recipe.action_noise)
+        if recipe.action_noise > 0
+        else expert
+    )

@@ -7,7 +7,7 @@ from lfd.core.errors import RecipeError, UnknownName
 from lfd.core.recipe import Table, build, load_toml
 
 FOLDER = "robot_configs"
-TABLES = ("robot", "teleop")
+TABLES = ("robot", "model", "teleop")
 FRAMES = ("base", "view", "gripper")
 CONTROLLERS = {
     "OSC_POSE": ("x", "y", "z", "rx", "ry", "rz"),
@@ -35,6 +35,32 @@ class RobotConfig:
     def check(self, where: str) -> None:
         if self.controller not in CONTROLLERS:
             raise UnknownName(f"controller in {where}:", self.controller, CONTROLLERS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotModel:
+    """The `[model]` table of a file in `robot_configs/`: what robosuite's model of the robot is like.
+
+    For those who plan with the arm; changing it does not change the simulation. A test compares every number.
+    """
+
+    gripper: str
+    """Name of the gripper in robosuite; tasks such as Wipe bring their own."""
+    home_rad: tuple[float, ...]
+    """Joint positions around which a reset draws its start [rad]."""
+    cameras: tuple[str, ...]
+    """Cameras that the robot carries."""
+    low_rad: tuple[float, ...]
+    """Lowest position of each joint of the arm; -inf where it turns freely [rad]."""
+    high_rad: tuple[float, ...]
+    """Highest position of each joint of the arm; inf where it turns freely [rad]."""
+    torque_n_m: tuple[float, ...]
+    """Largest torque at each joint of the arm [N m]."""
+
+    def check(self, where: str) -> None:
+        sizes = {key: len(getattr(self, key)) for key in ("home_rad", "low_rad", "high_rad", "torque_n_m")}
+        if len(set(sizes.values())) > 1:
+            raise RecipeError(f"{where}: each joint needs a number in all of {sizes}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +106,14 @@ def load_robot(name: str) -> RobotConfig:
     Raises `UnknownName` with the names of all configs.
     """
     return build(RobotConfig, _table(name, "robot"), f"{_path(name)} [robot]")
+
+
+def load_model(name: str) -> RobotModel:
+    """What robosuite's model of the robot called `name` is like.
+
+    Raises `UnknownName` with the names of all configs.
+    """
+    return build(RobotModel, _table(name, "model"), f"{_path(name)} [model]")
 
 
 def load_teleop(name: str) -> TeleopConfig:
