@@ -102,7 +102,7 @@ class PickPlaceCanExpert:
         sideways = float(np.hypot(away[0], away[1]))
         width = self._gripper.opening(observation)
         closed_on_it = HELD_WIDTH_M[0] < width < HELD_WIDTH_M[1] and self._gripper.has_stopped(observation)
-        if can[2] < LET_GO_M and (INSIDE_LOW < can[:2]).all() and (can[:2] < INSIDE_HIGH).all():
+        if can[2] < LET_GO_M and (can[:2] > INSIDE_LOW).all() and (can[:2] < INSIDE_HIGH).all():
             target, gripper = above(hand.position, AWAY_M * funnel(width, *FREE_M)), OPEN
         elif closed_on_it and np.linalg.norm(away) < SLIPPED_M:
             target, gripper = hand.position + _carried(can) - can, self._gripper.hold
