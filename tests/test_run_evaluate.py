@@ -68,3 +68,13 @@ def test_a_policy_decides_the_same_alone_and_among_others(thread, lift_world, rn
     together = policy.act_many(seen)
     for observation, decision in zip(seen, together, strict=True):
         np.testing.assert_array_equal(policy.act(observation).action, decision.action)
+
+
+def test_a_policy_is_run_on_another_robot_only_by_force(thread, tmp_path, lfd_fails) -> None:
+    said = lfd_fails("eval", thread.policy, "--robot", "ur5e", "--episodes", "1", "--out", tmp_path / "run")
+    assert "was trained for robot panda, not ur5e; add --force to run it all the same" in said
+    forced = lfd_fails(
+        "eval", thread.policy, "--robot", "ur5e", "--force", "--episodes", "1", "--out", tmp_path / "run"
+    )
+    assert "needs the observation 'joint_pos.robot0_joint1', which Lift with ur5e lacks" in forced
+    assert not (tmp_path / "run").exists()

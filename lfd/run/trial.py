@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfd.core.errors import RecipeError
+from lfd.core.errors import PolicyError, RecipeError
 from lfd.core.protocols import Observer
 from lfd.core.recipe import as_table
 from lfd.policies.acting import AskedOnce, LearnedPolicy, about_policy, camera_of
@@ -59,9 +59,13 @@ class Trial:
     ) -> "Trial":
         """The trial of a policy folder, on its own robot unless another is named (and forced on it).
 
-        Raises `PolicyError` for a folder that is no policy.
+        Raises `PolicyError` for a folder that is no policy, or made for another robot and not forced.
         """
         about = about_policy(policy, dataset)
+        if robot not in (None, about["robot"]) and not forced:
+            raise PolicyError(
+                f"{policy} was trained for robot {about['robot']}, not {robot}; add --force to run it all the same"
+            )
         return cls(policy, about, recipe, robot or about["robot"], forced)
 
     @property
