@@ -85,7 +85,7 @@ def test_unknown_policy(lfd_fails, thread, tmp_path) -> None:
     recipe.write_text(BC.read_text().replace("bc_mlp", "bc_mpl"))
     error = lfd_fails("train", recipe, "--dataset", thread.dataset, "--out", tmp_path / "out")
     assert "unknown policy type" in error
-    assert "'bc_mpl'; known: bc_mlp. Did you mean 'bc_mlp'?" in error
+    assert "'bc_mpl'; known: act, bc_mlp, bc_rnn, diffusion. Did you mean 'bc_mlp'?" in error
     assert not (tmp_path / "out").exists()
 
 
