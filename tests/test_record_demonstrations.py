@@ -124,8 +124,8 @@ def test_a_task_without_an_expert_loses_nothing(short, tmp_path) -> None:
     out = tmp_path / "out"
     record(replace(short, episodes=1, max_seconds=10.0), out, tables={})
     before = sorted(out.iterdir())
-    with pytest.raises(UnknownName, match="unknown task of a scripted expert 'Stack'; known: Lift"):
-        record(replace(short, task="Stack"), out, tables={}, overwrite=True)
+    with pytest.raises(UnknownName, match="unknown task of a scripted expert 'PickPlaceMilk'; known: Door, Lift"):
+        record(replace(short, task="PickPlaceMilk"), out, tables={}, overwrite=True)
     assert sorted(out.iterdir()) == before
 
 
