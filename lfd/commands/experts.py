@@ -62,7 +62,10 @@ def run_experts(given: Namespace) -> Result:
     table = expert_success(given.task or sorted(EXPERTS), given.robot or list(ROBOTS), trial, progress_bar)
     rows = {f"{task} {robot}": str(found) for task, row in table.items() for robot, found in row.items()}
     if given.results is not None:
-        command = f"lfd experts --episodes {given.episodes} --seed {given.seed}"
+        chosen = "".join(f" --task {task}" for task in given.task or ()) + "".join(
+            f" --robot {robot}" for robot in given.robot or ()
+        )
+        command = f"lfd experts{chosen} --episodes {given.episodes} --seed {given.seed}"
         write_section(given.results, "Scripted experts", command, rows)
     if given.json:
         return {task: {robot: asdict(found) for robot, found in row.items()} for task, row in table.items()}

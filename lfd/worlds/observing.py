@@ -85,7 +85,7 @@ class Sight:
             (data.site_xmat[model.site(site).id], self._seen[self.slices[f"{name}_quat"]])
             for name, site in hands.items()
         ]
-        self._dirt = _Dirt(model, data, markers, *hands.values()) if markers else None
+        self._dirt = _Dirt(model, data, markers, next(iter(hands.values()))) if markers else None
 
     def read(self) -> Float[np.ndarray, "Do"]:
         """The present observation; the same array at every call."""
