@@ -54,15 +54,15 @@ FUNNEL_M, TWIST_RAD = (0.008, 0.030), (0.15, 0.50)
 """Distance and angle beside a grip below which the hand goes all the way, and above which it hovers."""
 ACROSS_M, AROUND_M, AROUND_RAD = 0.018, 0.010, 0.20
 """How far a grip may be from the middle of the fingers, along their way and across it, and the angle."""
-HELD_M = 0.025
+HELD_M = 0.035
 """How far a grip may have slipped while it is held [m]."""
-FRAME_WIDTH_M, TOOL_WIDTH_M = (0.018, 0.0275), (0.0275, 0.036)
+FRAME_WIDTH_M, TOOL_WIDTH_M = (0.018, 0.0285), (0.027, 0.0345)
 """Opening of the fingers when they hold the frame's grip, of 0.0254 m, and the tool's, of 0.030 m [m]."""
 OPENED_M = (0.036, 0.055)
 """Opening of the fingers between which the hand begins to leave [m]."""
 CLEAR_M = 0.03
 """Height above the mount at which the frame's tip is brought over it [m]."""
-OVER_M, INSIDE_M = (0.002, 0.008), 0.007
+OVER_M, INSIDE_M = (0.0025, 0.012), 0.007
 """Distance of the tip from the mount's axis below which it goes down, above which it stays high, and below which a tip
 lower than the top is inside [m]."""
 UPRIGHT_RAD = (0.06, 0.25)
@@ -85,10 +85,12 @@ HIGH_M = 0.05
 """Height of the ring above the hook at which it is brought over it [m]."""
 TILT_RAD = (0.72, 1.22)
 """Angle of the tool from hanging when the ring is around the bar, and above the post [rad]."""
+LET_GO_RAD = 0.9
+"""Angle below which the tool, let go with the ring around the bar, swings into place [rad]."""
 TILTING_M = (0.002, 0.014)
 """Height of the ring above the bar between which the tool tilts [m]."""
-RING_M = 0.0045
-"""Distance of the ring's middle from the end of the bar [m]."""
+RING_M = (0.0060, 0.0045)
+"""Distance of the ring's middle from the end of the bar when it is around it, and above the post [m]."""
 POST_M = (0.0015, 0.006)
 """Distance of the ring from there, below which it goes down over the post, and above which it stays high [m]."""
 THREADED_M = (0.006, 0.009)
@@ -151,7 +153,7 @@ class ToolHangExpert:
         if not stands(tip - top):
             if self._holds(observation, hand, frame_grip, FRAME_WIDTH_M):
                 return insert(hand, frame, tip, top)
-            return self._grasp(hand, frame_grip)
+            return grasp(hand, frame_grip)
         ring = Pose(observation["ring_point"], tool.rotation)
         tool_grip = Pose(tool.position + self._along * tool.rotation[:, 0], tool_hand(tool.rotation))
         placed = about_hook(ring, observation["hook_point"], frame)
@@ -161,21 +163,11 @@ class ToolHangExpert:
             return hang(hand, ring, placed, frame)
         if is_at(hand, frame_grip):
             return self._leave(observation, hand)
-        return over_stand(hand, self._grasp(hand, tool_grip), top, observation["hook_point"])
+        return over_stand(hand, grasp(hand, tool_grip), top, observation["hook_point"])
 
     def _holds(self, observation: Observation, hand: Hand, grip: Pose, width: tuple[float, float]) -> bool:
         opening = self._gripper.opening(observation)
-        near = float(np.linalg.norm(hand.position - grip.position)) < HELD_M
-        return near and width[0] < opening < width[1] and self._gripper.has_stopped(observation)
-
-    def _grasp(self, hand: Hand, grip: Pose) -> Move:
-        """Towards a grip along the hand's axis, from before it; around it, close."""
-        away = grip.rotation.T @ (hand.position - grip.position)
-        twist = float(np.linalg.norm(rotvec_between(hand.rotation, grip.rotation)))
-        off = max(funnel(float(np.hypot(away[0], away[1])), *FUNNEL_M), funnel(twist, *TWIST_RAD))
-        around = abs(away[0]) < ACROSS_M and max(abs(away[1]), abs(away[2])) < AROUND_M and twist < AROUND_RAD
-        position = grip.position - HOVER_M * off * grip.rotation[:, 2]
-        return Move(position, slowly(hand.rotation, grip.rotation), CLOSE if around else OPEN)
+        return float(np.linalg.norm(hand.position - grip.position)) < HELD_M and width[0] < opening < width[1]
 
     def _leave(self, observation: Observation, hand: Hand) -> Move:
         """Open, then straight back along the fingers, to some distance from the hook."""
@@ -184,24 +176,42 @@ class ToolHangExpert:
         return Move(hand.position - back * hand.rotation[:, 2], hand.rotation, OPEN)
 
 
+def grasp(hand: Hand, grip: Pose) -> Move:
+    """Towards a grip along the hand's axis, from before it; around it, close."""
+    away = grip.rotation.T @ (hand.position - grip.position)
+    twist = float(np.linalg.norm(rotvec_between(hand.rotation, grip.rotation)))
+    off = max(funnel(float(np.hypot(away[0], away[1])), *FUNNEL_M), funnel(twist, *TWIST_RAD))
+    around = abs(away[0]) < ACROSS_M and max(abs(away[1]), abs(away[2])) < AROUND_M and twist < AROUND_RAD
+    position = grip.position - HOVER_M * off * grip.rotation[:, 2]
+    return Move(position, slowly(hand.rotation, grip.rotation), CLOSE if around else OPEN)
+
+
 def stands(tip: Float[np.ndarray, "3"]) -> bool:
     """Whether the frame stands in the mount, from its tip relative to the mount's top."""
     return float(np.hypot(tip[0], tip[1])) < INSIDE_M and float(tip[2]) < STANDS_M - BOTTOM_M
 
 
 def insert(hand: Hand, frame: Pose, tip: Float[np.ndarray, "3"], top: Float[np.ndarray, "3"]) -> Move:
-    """Bring the frame's tip over the mount with the frame upright, and down into it."""
+    """Bring the frame's tip over the mount with the frame upright, and down into it.
+
+    The hand goes where it will be when the frame is upright, so that it turns there and not at arm's length from it.
+    """
     ahead = np.array([0.0, -1.0, 0.0])
     goal = np.column_stack([np.cross(ahead, UP), ahead, UP])
-    aside, height = float(np.hypot(*(tip - top)[:2])), float(tip[2] - top[2])
+    upright = hand.position - goal @ frame.rotation.T @ (hand.position - tip)  # where the tip will be
+    aside, height = float(np.hypot(*(upright - top)[:2])), float(upright[2] - top[2])
+    tip_aside = float(np.hypot(*(tip - top)[:2]))
     tilt = float(np.arccos(min(frame.rotation[2, 2], 1.0)))
-    off = max(funnel(aside, *OVER_M), funnel(tilt, *UPRIGHT_RAD))
-    if height < 0 and aside < INSIDE_M:
+    away = max(aside, tip_aside)
+    off = max(funnel(away, *OVER_M), funnel(tilt, *UPRIGHT_RAD))
+    if tip[2] < top[2] and tip_aside < INSIDE_M:
         off = 0.0
     free = max(funnel(height, CLEAR_M - 0.020, CLEAR_M - 0.010), funnel(aside, *BESIDE_M), 1.0 - off)
-    down = max(CLEAR_M * off - (BOTTOM_M + SINK_M) * (1.0 - off) - height, -SINK_M - 0.03 * off)
-    target = tip + np.array([*(free * (top - tip)[:2]), down])
-    return placing(hand, Pose(tip, frame.rotation), Pose(target, goal))
+    goal_height = CLEAR_M * off if off > 0.0 else -BOTTOM_M - SINK_M
+    down = max(goal_height - height, -SINK_M - 0.03 * off)
+    step = np.array([*(free * (top - upright)[:2]), down])
+    rotation = slowly(frame.rotation, goal) @ frame.rotation.T @ hand.rotation
+    return Move(hand.position + step, rotation, CLOSE)
 
 
 def placing(hand: Hand, held: Pose, goal: Pose) -> Move:
@@ -269,8 +279,8 @@ class AboutHook:
     @property
     def is_hung(self) -> bool:
         """Whether the tool hangs, or would swing into place when it is let go."""
-        around = abs(self.aside) < 0.006 and -0.012 < self.height < 0.005
-        return around and 0.001 < self.inward < 0.085 and self.tilt < TILT_RAD[0] + 0.15
+        around = abs(self.aside) < 0.006 and -0.012 < self.height < 0.0035
+        return around and 0.003 < self.inward < 0.085 and self.tilt < min(LET_GO_RAD + 40 * (self.inward - 0.003), 1.18)
 
 
 def about_hook(ring: Pose, hook: Float[np.ndarray, "3"], frame: Pose) -> AboutHook:
@@ -282,17 +292,18 @@ def about_hook(ring: Pose, hook: Float[np.ndarray, "3"], frame: Pose) -> AboutHo
 
 def hang(hand: Hand, ring: Pose, placed: AboutHook, frame: Pose) -> Move:
     """Bring the ring over the hook's post with the handle pointing away from the stand, and down around the bar."""
-    away = float(np.hypot(placed.inward - RING_M, placed.aside))
-    tilt = TILT_RAD[0] + (TILT_RAD[1] - TILT_RAD[0]) * funnel(placed.height, *TILTING_M)
+    high = funnel(placed.height, *TILTING_M)
+    tilt, inward = (low + (up - low) * high for low, up in (TILT_RAD, RING_M))
+    away = float(np.hypot(placed.inward - inward, placed.aside))
     handle = -np.sin(tilt) * frame.rotation[:, 0] - np.cos(tilt) * frame.rotation[:, 2]
     face = np.cos(tilt) * frame.rotation[:, 0] - np.sin(tilt) * frame.rotation[:, 2]
     face = face * np.copysign(1.0, face @ ring.rotation[:, 2])
     goal = np.column_stack([handle, np.cross(face, handle), face])
     twist = float(np.linalg.norm(rotvec_between(ring.rotation, goal)))
-    threaded = (1.0 - funnel(away, *THREADED_M)) * (1.0 - funnel(placed.height, *TILTING_M))
+    threaded = (1.0 - funnel(away, *THREADED_M)) * (1.0 - high)
     off = max(funnel(away, *POST_M), funnel(twist, *TWIST_RAD)) * (1.0 - threaded)
     free = max(funnel(away, *BESIDE_HOOK_M), funnel(placed.height, HIGH_M - 0.025, HIGH_M - 0.010), 1.0 - off)
-    wanted = np.array([RING_M, 0.0, HIGH_M * off])
+    wanted = np.array([inward, 0.0, HIGH_M * off])
     step = wanted - np.array([placed.inward, placed.aside, placed.height])
     step = np.array([free * step[0], free * step[1], max(step[2], -0.02)])
     return placing(hand, ring, Pose(ring.position + frame.rotation @ step, goal))
