@@ -13,6 +13,7 @@ from lfd.experts.nut_assembly_square import NutAssemblySquareExpert
 from lfd.experts.pick_place_can import PickPlaceCanExpert
 from lfd.experts.stack import StackExpert
 from lfd.experts.style import PLAIN, ExpertStyle
+from lfd.experts.tool_hang import ToolHangExpert
 from lfd.experts.two_arm_lift import TwoArmLiftExpert
 from lfd.experts.wipe import WipeExpert
 
@@ -22,6 +23,7 @@ EXPERTS: dict[str, Callable[[WorldSpec, ExpertStyle], Policy]] = {
     "NutAssemblySquare": NutAssemblySquareExpert,
     "PickPlaceCan": PickPlaceCanExpert,
     "Stack": StackExpert,
+    "ToolHang": ToolHangExpert,
     "TwoArmLift": TwoArmLiftExpert,
     "Wipe": WipeExpert,
 }

@@ -85,8 +85,9 @@ HIGH_M = 0.05
 """Height of the ring above the hook at which it is brought over it [m]."""
 TILT_RAD = (0.72, 1.22)
 """Angle of the tool from hanging when the ring is around the bar, and above the post [rad]."""
-LET_GO_RAD = 0.9
-"""Angle below which the tool, let go with the ring around the bar, swings into place [rad]."""
+LET_GO_RAD, PAST_POST_M, BAR_M = (0.9, 1.2), (0.003, 0.0095), 0.085
+"""Angle below which the tool, let go with the ring around the bar, swings into place: from that where the ring is just
+past the post's middle to that where it is past the post. And how far it may be along the bar [rad, m]."""
 TILTING_M = (0.002, 0.014)
 """Height of the ring above the bar between which the tool tilts [m]."""
 RING_M = (0.0060, 0.0045)
@@ -201,7 +202,7 @@ def insert(hand: Hand, frame: Pose, tip: Float[np.ndarray, "3"], top: Float[np.n
     upright = hand.position - goal @ frame.rotation.T @ (hand.position - tip)  # where the tip will be
     aside, height = float(np.hypot(*(upright - top)[:2])), float(upright[2] - top[2])
     tip_aside = float(np.hypot(*(tip - top)[:2]))
-    tilt = float(np.arccos(min(frame.rotation[2, 2], 1.0)))
+    tilt = float(np.arccos(np.clip(frame.rotation[2, 2], -1.0, 1.0)))
     away = max(aside, tip_aside)
     off = max(funnel(away, *OVER_M), funnel(tilt, *UPRIGHT_RAD))
     if tip[2] < top[2] and tip_aside < INSIDE_M:
@@ -280,7 +281,9 @@ class AboutHook:
     def is_hung(self) -> bool:
         """Whether the tool hangs, or would swing into place when it is let go."""
         around = abs(self.aside) < 0.006 and -0.012 < self.height < 0.0035
-        return around and 0.003 < self.inward < 0.085 and self.tilt < min(LET_GO_RAD + 40 * (self.inward - 0.003), 1.18)
+        share = 1.0 - funnel(self.inward, *PAST_POST_M)
+        most = LET_GO_RAD[0] * share + LET_GO_RAD[1] * (1.0 - share)
+        return around and PAST_POST_M[0] < self.inward < BAR_M and self.tilt < most
 
 
 def about_hook(ring: Pose, hook: Float[np.ndarray, "3"], frame: Pose) -> AboutHook:
