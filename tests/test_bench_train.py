@@ -96,14 +96,15 @@ def test_sides_take_turns_and_a_ratio_is_that_of_the_same_turn() -> None:
     assert drifting.rate("a") == 20
 
 
-def test_a_peer_takes_the_steps_that_it_is_asked_for_and_says_why_it_ends(tmp_path, monkeypatch) -> None:
+def test_a_peer_takes_the_steps_that_it_is_asked_for_and_says_why_it_ends(tmp_path) -> None:
     import lfd.bench.peers.process as process
 
     serving = Path(process.__file__).with_name("serving.py")
     (tmp_path / "serving.py").write_text(serving.read_text())
     (tmp_path / "program.py").write_text(PEER)
-    monkeypatch.setattr(process, "__file__", str(tmp_path / "process.py"))
-    with Peer(Path(sys.executable), "program.py", tmp_path / "rows", hidden_sizes=[32], batch_size=8) as peer:
+    with Peer(
+        Path(sys.executable), tmp_path / "program.py", tmp_path / "rows", hidden_sizes=[32], batch_size=8
+    ) as peer:
         assert 0 <= peer(3) < 1
         assert 0 <= peer(5) < 1
         with pytest.raises(PeerError, match=r"program.py ended: too many steps"):
@@ -122,15 +123,19 @@ def test_a_peer_that_cannot_be_installed_is_a_sentence(tmp_path, monkeypatch) ->
     assert said == ["installing robomimic and imitation in an environment of their own"]
 
 
-def test_threads_are_given_back(monkeypatch) -> None:
+def test_threads_are_given_back() -> None:
     import lfd.bench.train as train
 
-    monkeypatch.setattr(train, "make_dataset", lambda *given: (_ for _ in ()).throw(KeyboardInterrupt))
+    def interrupted(label: str, total: int):
+        raise KeyboardInterrupt
+
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
         with pytest.raises(KeyboardInterrupt):
-            train.bench_train(episodes=1, turns=1, seconds=0.1, peers=False, workers=False, seed=0)
+            train.bench_train(
+                episodes=1, turns=1, seconds=0.1, peers=False, workers=False, seed=0, progress=interrupted
+            )
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)

@@ -170,15 +170,18 @@ def test_ctrl_c_keeps_finished_episodes(tmp_path) -> None:
     assert list(out.glob("*.part")) == []
 
 
-@pytest.mark.parametrize("command", ["record", "convert", "replay"])
+@pytest.mark.parametrize("command", ["record", "convert", "replay", "train", "train with checkpoints"])
 def test_a_disk_that_takes_no_more_leaves_nothing_half_written(command, thread, tmp_path) -> None:
     """A limit on the size of files stands for the full disk: writes fail in the same places."""
     import resource
 
+    train = ["train", str(BC), "--dataset", str(thread.dataset), "--steps", "20"]
     arguments = {
         "record": ["record", str(LIFT), "--episodes", "1", "--out", str(tmp_path / "out")],
         "convert": ["convert", str(thread.recordings), "--out", str(tmp_path / "out")],
         "replay": ["replay", str(thread.recordings), "--save", str(tmp_path / "out.rrd")],
+        "train": [*train, "--out", str(tmp_path / "out")],
+        "train with checkpoints": [*train, "--set", "train.checkpoint_every=5", "--out", str(tmp_path / "out")],
     }[command]
     done = subprocess.run(
         [sys.executable, "-m", "lfd.cli", *arguments],

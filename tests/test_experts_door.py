@@ -5,13 +5,12 @@ import numpy as np
 import pytest
 
 from lfd.core.errors import InputError
-from lfd.core.protocols import Decision
 from lfd.core.rotations import matrix_from_wxyz
 from lfd.experts.door import GRASPS_M, LATCH_M, DoorExpert, _on_handle, _swung
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.style import ExpertStyle
 from lfd.run.wilson import wilson_interval
-from lfd.worlds.rollout import episode_rng, rollout
+from tests.expert_trials import Meddled, check_same_action, once, pushed, successes
 
 
 @pytest.fixture(scope="module")
@@ -19,30 +18,6 @@ def world():
     from lfd import make_world
 
     return make_world("Door", "panda", 20)
-
-
-def successes(world, policy, seed: int, episodes: int, horizon: int = 300) -> int:
-    return sum(
-        rollout(world, policy, [], episode_rng("eval", seed, i), horizon=horizon, hold_steps=10).success
-        for i in range(episodes)
-    )
-
-
-class Disturbed:
-    """The expert, with something happening at a step of its episode."""
-
-    name = "disturbed"
-
-    def __init__(self, expert, happens):
-        self.expert, self.happens = expert, happens
-
-    def reset(self, rng):
-        self.expert.reset(rng)
-        self.step, self.rng = 0, rng
-
-    def act(self, observation):
-        self.step += 1
-        return self.happens(self, observation) or self.expert.act(observation)
 
 
 @pytest.mark.slow
@@ -59,43 +34,31 @@ def test_door_succeeds_with_noise_at_every_speed_and_with_every_grasp(world) -> 
 
 def test_the_expert_recovers_from_pushes(world) -> None:
     """Half a second of random actions, at any time."""
-
-    def push(me, _):
-        if me.step == 1:
-            me.at = me.rng.integers(5, 60)
-        return Decision(me.rng.uniform(-1, 1, 7)) if me.at <= me.step < me.at + 10 else None
-
-    assert successes(world, Disturbed(DoorExpert(world.spec), push), 42, 20) >= 18
+    assert successes(world, Meddled(DoorExpert(world.spec), pushed(world, (5, 60))), 42, 20) >= 18
 
 
 def test_the_expert_follows_a_door_that_is_moved(world) -> None:
     frame = world._model.body("Door_main").id
 
-    def move(me, _):
-        if me.step == 14:
-            world._model.body_pos[frame, :2] += me.rng.uniform(-0.03, 0.03, 2)
+    def move(rng) -> None:
+        world._model.body_pos[frame, :2] += rng.uniform(-0.03, 0.03, 2)
 
-    assert successes(world, Disturbed(DoorExpert(world.spec), move), 44, 10) >= 9
+    assert successes(world, Meddled(DoorExpert(world.spec), once(14, move)), 44, 10) >= 9
 
 
 def test_the_expert_opens_a_door_that_stands_ajar(world) -> None:
     """The hand is not at it and the latch has sprung back: it would never have got there."""
     hinge = world._model.joint("Door_hinge").qposadr[0]
 
-    def ajar(me, _):
-        if me.step == 1:
-            world._data.qpos[hinge] = 0.25
-            mujoco.mj_forward(world._model, world._data)
+    def ajar(rng) -> None:
+        world._data.qpos[hinge] = 0.25
+        mujoco.mj_forward(world._model, world._data)
 
-    assert successes(world, Disturbed(DoorExpert(world.spec), ajar), 45, 10) >= 9
+    assert successes(world, Meddled(DoorExpert(world.spec), once(1, ajar)), 45, 10) >= 9
 
 
 def test_the_same_observation_gives_the_same_action(world) -> None:
-    first, second = DoorExpert(world.spec), DoorExpert(world.spec)
-    seen = world.reset(np.random.default_rng(1))
-    for _ in range(30):
-        seen = world.step(first.act(seen).action).observation
-    np.testing.assert_array_equal(first.act(seen).action, second.act(seen).action)
+    check_same_action(world, lambda: DoorExpert(world.spec), 30)
 
 
 def test_points_of_the_handle_are_where_the_model_has_them(world) -> None:

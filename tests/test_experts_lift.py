@@ -2,52 +2,29 @@ import numpy as np
 import pytest
 
 from lfd import make_world
-from lfd.core.protocols import Decision
 from lfd.experts.lift import LiftExpert
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.registry import make_expert
 from lfd.run.wilson import wilson_interval
 from lfd.worlds.rollout import episode_rng, rollout
+from tests.expert_trials import Meddled, check_same_action, pushed, successes
 
 
 @pytest.mark.slow
 def test_lift_succeeds_from_at_least_98_percent_of_200_starts(lift_world) -> None:
     expert = make_expert(lift_world.spec)
-    outcomes = [
-        rollout(lift_world, expert, [], episode_rng("eval", 41, i), horizon=200, hold_steps=10) for i in range(200)
-    ]
-    successes = sum(outcome.success for outcome in outcomes)
-    assert successes >= 196, wilson_interval(successes, 200)
+    solved = successes(lift_world, expert, 41, 200, 200)
+    assert solved >= 196, wilson_interval(solved, 200)
 
 
-def test_the_expert_recovers_from_states_that_it_would_not_have_reached(lift_world, rng) -> None:
+def test_the_expert_recovers_from_states_that_it_would_not_have_reached(lift_world) -> None:
     """It acts from the present state alone: half a second of random actions in between do no harm."""
     expert = make_expert(lift_world.spec)
-
-    class Disturbed:
-        name = "disturbed"
-
-        def reset(self, rng):
-            self.step = 0
-
-        def act(self, observation):
-            self.step += 1
-            if 12 <= self.step < 22:
-                return Decision(rng.uniform(-1, 1, 7))
-            return expert.act(observation)
-
-    outcomes = [
-        rollout(lift_world, Disturbed(), [], episode_rng("eval", 42, i), horizon=300, hold_steps=10) for i in range(10)
-    ]
-    assert sum(outcome.success for outcome in outcomes) >= 9
+    assert successes(lift_world, Meddled(expert, pushed(lift_world, 12)), 42, 10) >= 9
 
 
 def test_the_same_observation_gives_the_same_action(lift_world) -> None:
-    first, second = LiftExpert(lift_world.spec), LiftExpert(lift_world.spec)
-    seen = lift_world.reset(np.random.default_rng(1))
-    for _ in range(5):
-        lift_world.step(first.act(seen).action)
-    np.testing.assert_array_equal(first.act(seen).action, second.act(seen).action)
+    check_same_action(lift_world, lambda: LiftExpert(lift_world.spec), 30)
 
 
 def test_noise_is_applied_and_the_label_stays_clean(lift_world) -> None:

@@ -1,21 +1,17 @@
-from collections.abc import Callable
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from lfd import make_world
 from lfd.core.errors import InputError
-from lfd.core.protocols import Decision
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.nut_assembly_square import HANDLE_M, NutAssemblySquareExpert, levelling, turned
 from lfd.experts.style import ExpertStyle
 from lfd.run.wilson import wilson_interval
 from lfd.worlds.rollout import episode_rng, rollout
-
-JOINT = "SquareNut_joint0"
+from tests.expert_trials import Meddled, check_same_action, once, pushed, put, successes
 
 
 @pytest.fixture(scope="module")
@@ -23,39 +19,9 @@ def world():
     return make_world("NutAssemblySquare", "panda", 20)
 
 
-class Meddled:
-    """An expert in whose episodes something happens at a step, or random actions are taken from it on."""
-
-    name = "meddled"
-
-    def __init__(self, expert, at: int, happens: Callable[[], None] | None = None, pushes: int = 0):
-        self._expert, self._at, self._happens, self._pushes = expert, at, happens, pushes
-
-    def reset(self, rng):
-        self._expert.reset(rng)
-        self._rng, self._step = rng, 0
-
-    def act(self, observation):
-        self._step += 1
-        if self._step == self._at and self._happens:
-            self._happens()
-        if self._at <= self._step < self._at + self._pushes:
-            return Decision(self._rng.uniform(-1, 1, 7))
-        return self._expert.act(observation)
-
-
 def put_nut(world, position, yaw: float) -> None:
-    """Put the nut somewhere, flat and at rest."""
-    free = world._data.joint(JOINT)
-    free.qpos[:], free.qvel[:] = [*position, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], 0.0
-    mujoco.mj_forward(world._model, world._data)
-
-
-def successes(world, policy, seed: int, episodes: int, horizon: int = 300) -> int:
-    return sum(
-        rollout(world, policy, [], episode_rng("eval", seed, i), horizon=horizon, hold_steps=10).success
-        for i in range(episodes)
-    )
+    """Put the nut somewhere, flat."""
+    put(world, "SquareNut_joint0", position, [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
 
 
 @pytest.mark.slow
@@ -68,13 +34,13 @@ def test_the_nut_is_put_on_its_peg_from_at_least_95_percent_of_200_starts(world)
 @pytest.mark.parametrize(("at", "least"), [(10, 14), (35, 14), (60, 12)])
 def test_it_recovers_from_random_actions(world, at, least) -> None:
     """While it reaches, while it carries, and over the peg, where a push may stretch the arm for good."""
-    assert successes(world, Meddled(NutAssemblySquareExpert(world.spec), at, pushes=10), 42, 15) >= least
+    assert successes(world, Meddled(NutAssemblySquareExpert(world.spec), pushed(world, at)), 42, 15) >= least
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [15, 30, 55])
 def test_it_recovers_from_a_nut_put_elsewhere(world, at) -> None:
-    policy = Meddled(NutAssemblySquareExpert(world.spec), at, lambda: put_nut(world, [0.0, -0.05, 0.84], 2.5))
+    policy = Meddled(NutAssemblySquareExpert(world.spec), once(at, lambda _: put_nut(world, [0.0, -0.05, 0.84], 2.5)))
     assert successes(world, policy, 42, 15) >= 14
 
 
@@ -88,19 +54,12 @@ def test_every_speed_and_grasp_succeeds_under_noise(world) -> None:
 def test_every_yaw_of_the_nut_is_within_the_wrist_s_reach(world) -> None:
     expert = NutAssemblySquareExpert(world.spec)
     for yaw in np.linspace(-np.pi, np.pi, 17)[1:]:
-        policy = Meddled(expert, 1, lambda yaw=yaw: put_nut(world, [-0.11, 0.22, 0.84], yaw))
+        policy = Meddled(expert, once(1, lambda _, yaw=yaw: put_nut(world, [-0.11, 0.22, 0.84], yaw)))
         assert rollout(world, policy, [], episode_rng("eval", 45, 0), horizon=300, hold_steps=10).success, yaw
 
 
 def test_the_same_observation_gives_the_same_action(world) -> None:
-    first, second = NutAssemblySquareExpert(world.spec), NutAssemblySquareExpert(world.spec)
-    seen = world.reset(np.random.default_rng(1))
-    for _ in range(90):
-        decision = first.act(seen)
-        np.testing.assert_array_equal(decision.action, decision.expert_action)
-        np.testing.assert_array_equal(decision.action, second.act(seen).action)
-        assert np.abs(decision.action).max() <= 1.0
-        seen = world.step(decision.action).observation
+    check_same_action(world, lambda: NutAssemblySquareExpert(world.spec), 90)
 
 
 def test_the_drawn_speed_bounds_the_action(world) -> None:

@@ -5,7 +5,7 @@ from lfd import make_world
 from lfd.experts.pick_place_can import BIN_CENTRE, BIN_HALF, GRASPS, PickPlaceCanExpert
 from lfd.experts.style import ExpertStyle
 from lfd.run.wilson import wilson_interval
-from tests.test_experts_stack import Meddled, put, successes
+from tests.expert_trials import Meddled, check_same_action, once, pushed, put, successes
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def test_it_succeeds_from_at_least_98_percent_of_200_starts(world) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [15, 40, 75])
 def test_it_recovers_from_random_actions(world, at) -> None:
-    assert successes(world, Meddled(PickPlaceCanExpert(world.spec), at, pushes=10), 42, 10, 400) >= 9
+    assert successes(world, Meddled(PickPlaceCanExpert(world.spec), pushed(world, at)), 42, 10, 400) >= 9
 
 
 @pytest.mark.slow
@@ -30,17 +30,15 @@ def test_it_recovers_from_random_actions(world, at) -> None:
 @pytest.mark.parametrize("place", [(0.0, -0.35, 0.86), (0.1, -0.05, 0.86), (0.25, -0.2, 0.86)])
 def test_it_recovers_from_a_can_put_elsewhere(world, at, place) -> None:
     """Also by a wall, nearer than it ever starts."""
-    policy = Meddled(PickPlaceCanExpert(world.spec), at, lambda: put(world, "Can_joint0", place))
+    policy = Meddled(PickPlaceCanExpert(world.spec), once(at, lambda _: put(world, "Can_joint0", place)))
     assert successes(world, policy, 42, 5, 400) >= 4
 
 
 @pytest.mark.slow
 def test_a_can_that_has_fallen_over_is_picked_up_across(world) -> None:
-    def falls() -> None:
-        put(world, "Can_joint0", [0.05, -0.25, 0.85])
-        world._data.joint("Can_joint0").qpos[3:] = np.array([1.0, np.cos(0.4), np.sin(0.4), 0.0]) / np.sqrt(2)
-
-    assert successes(world, Meddled(PickPlaceCanExpert(world.spec), 5, falls), 42, 10, 400) >= 9
+    lying = np.array([1.0, np.cos(0.4), np.sin(0.4), 0.0]) / np.sqrt(2)
+    fallen = once(5, lambda _: put(world, "Can_joint0", [0.05, -0.25, 0.85], lying))
+    assert successes(world, Meddled(PickPlaceCanExpert(world.spec), fallen), 42, 10, 400) >= 9
 
 
 @pytest.mark.slow
@@ -50,14 +48,7 @@ def test_every_grasp_and_speed_succeeds(world) -> None:
 
 
 def test_the_same_observation_gives_the_same_action(world) -> None:
-    first, second = PickPlaceCanExpert(world.spec), PickPlaceCanExpert(world.spec)
-    seen = world.reset(np.random.default_rng(1))
-    for _ in range(30):
-        decision = first.act(seen)
-        np.testing.assert_array_equal(decision.action, decision.expert_action)
-        np.testing.assert_array_equal(decision.action, second.act(seen).action)
-        assert np.abs(decision.action).max() <= 1.0
-        seen = world.step(decision.action).observation
+    check_same_action(world, lambda: PickPlaceCanExpert(world.spec), 30)
 
 
 @pytest.mark.parametrize("grasp", range(len(GRASPS)))

@@ -1,58 +1,20 @@
-from collections.abc import Callable
 from dataclasses import replace
 
-import mujoco
 import numpy as np
 import pytest
 
 from lfd import make_world
-from lfd.core.protocols import Decision
 from lfd.experts.grippers import gripper_of
 from lfd.experts.reaching import Hand, pointing_down, side_yaw
 from lfd.experts.stack import GRASPS, RADIUS_B_M, StackExpert
 from lfd.experts.style import ExpertStyle
 from lfd.run.wilson import wilson_interval
-from lfd.worlds.rollout import episode_rng, rollout
+from tests.expert_trials import Meddled, check_same_action, once, pushed, put, successes
 
 
 @pytest.fixture(scope="module")
 def world():
     return make_world("Stack", "panda", 20)
-
-
-class Meddled:
-    """An expert in whose episodes something happens at a step, or random actions are taken from it on."""
-
-    name = "meddled"
-
-    def __init__(self, expert, at: int, happens: Callable[[], None] | None = None, pushes: int = 0):
-        self._expert, self._at, self._happens, self._pushes = expert, at, happens, pushes
-
-    def reset(self, rng):
-        self._expert.reset(rng)
-        self._rng, self._step = rng, 0
-
-    def act(self, observation):
-        self._step += 1
-        if self._step == self._at and self._happens:
-            self._happens()
-        if self._at <= self._step < self._at + self._pushes:
-            return Decision(self._rng.uniform(-1, 1, 7))
-        return self._expert.act(observation)
-
-
-def put(world, joint: str, position) -> None:
-    """Put a free object somewhere, at rest and upright."""
-    free = world._data.joint(joint)
-    free.qpos[:], free.qvel[:] = [*position, 1.0, 0.0, 0.0, 0.0], 0.0
-    mujoco.mj_forward(world._model, world._data)
-
-
-def successes(world, policy, seed: int, episodes: int, horizon: int = 300) -> int:
-    return sum(
-        rollout(world, policy, [], episode_rng("eval", seed, i), horizon=horizon, hold_steps=10).success
-        for i in range(episodes)
-    )
 
 
 @pytest.mark.slow
@@ -74,15 +36,15 @@ def test_the_same_expert_stacks_with_every_arm(robot, least, horizon) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [10, 25, 40])
 def test_it_recovers_from_random_actions(world, at) -> None:
-    assert successes(world, Meddled(StackExpert(world.spec), at, pushes=10), 42, 15) >= 14
+    assert successes(world, Meddled(StackExpert(world.spec), pushed(world, at)), 42, 15) >= 14
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [15, 30, 45])
 def test_it_recovers_from_a_cube_put_elsewhere(world, at) -> None:
-    policy = Meddled(StackExpert(world.spec), at, lambda: put(world, "cubeA_joint0", [0.09, -0.12, 0.82]))
+    policy = Meddled(StackExpert(world.spec), once(at, lambda _: put(world, "cubeA_joint0", [0.09, -0.12, 0.82])))
     assert successes(world, policy, 42, 15) >= 14
-    policy = Meddled(StackExpert(world.spec), at, lambda: put(world, "cubeB_joint0", [-0.09, 0.13, 0.825]))
+    policy = Meddled(StackExpert(world.spec), once(at, lambda _: put(world, "cubeB_joint0", [-0.09, 0.13, 0.825])))
     assert successes(world, policy, 42, 15) >= 14
 
 
@@ -93,14 +55,7 @@ def test_every_grasp_and_speed_stacks(world) -> None:
 
 
 def test_the_same_observation_gives_the_same_action(world) -> None:
-    first, second = StackExpert(world.spec), StackExpert(world.spec)
-    seen = world.reset(np.random.default_rng(1))
-    for _ in range(30):
-        decision = first.act(seen)
-        np.testing.assert_array_equal(decision.action, decision.expert_action)
-        np.testing.assert_array_equal(decision.action, second.act(seen).action)
-        assert np.abs(decision.action).max() <= 1.0
-        seen = world.step(decision.action).observation
+    check_same_action(world, lambda: StackExpert(world.spec), 30)
 
 
 @pytest.mark.parametrize("robot", ["panda", "ur5e", "iiwa"])

@@ -1,12 +1,8 @@
-from collections.abc import Callable
-
-import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from lfd import make_world
-from lfd.core.protocols import Decision
 from lfd.core.rotations import matrix_from_wxyz
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.reaching import Hand
@@ -26,7 +22,9 @@ from lfd.experts.tool_hang import (
     slowly,
 )
 from lfd.run.wilson import wilson_interval
-from lfd.worlds.rollout import episode_rng, rollout
+from tests.expert_trials import Meddled, check_same_action, once, pushed, put, successes
+
+HORIZON = 800
 
 
 @pytest.fixture(scope="module")
@@ -34,76 +32,40 @@ def world():
     return make_world("ToolHang", "panda", 20)
 
 
-class Meddled:
-    """An expert in whose episodes something happens at a step, or random actions are taken from it on."""
-
-    name = "meddled"
-
-    def __init__(self, expert, at: int, happens: Callable[[], None] | None = None, pushes: int = 0):
-        self._expert, self._at, self._happens, self._pushes = expert, at, happens, pushes
-
-    def reset(self, rng):
-        self._expert.reset(rng)
-        self._rng, self._step = rng, 0
-
-    def act(self, observation):
-        self._step += 1
-        if self._step == self._at and self._happens:
-            self._happens()
-        if self._at <= self._step < self._at + self._pushes:
-            return Decision(self._rng.uniform(-1, 1, 7))
-        return self._expert.act(observation)
-
-
 def shift(world, name: str, by) -> None:
     """Move a free object that lies on the table aside."""
-    free = world._data.joint(f"{name}_joint0")
-    free.qpos[:3], free.qvel[:] = free.qpos[:3] + by, 0.0
-    mujoco.mj_forward(world._model, world._data)
-
-
-def successes(world, policy, seed: int, episodes: int, horizon: int = 800) -> int:
-    return sum(
-        rollout(world, policy, [], episode_rng("eval", seed, i), horizon=horizon, hold_steps=10).success
-        for i in range(episodes)
-    )
+    was = world._data.joint(f"{name}_joint0").qpos
+    put(world, f"{name}_joint0", was[:3] + by, was[3:])
 
 
 @pytest.mark.slow
 def test_the_tool_is_hung_from_at_least_95_percent_of_60_starts(world) -> None:
-    solved = successes(world, ToolHangExpert(world.spec), 41, 60)
+    solved = successes(world, ToolHangExpert(world.spec), 41, 60, HORIZON)
     assert solved >= 57, wilson_interval(solved, 60)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("at", "name", "by"), [(20, "frame", [-0.03, 0.02, 0.0]), (150, "tool", [0.04, -0.03, 0.0])])
 def test_it_recovers_from_things_put_elsewhere(world, at, name, by) -> None:
-    policy = Meddled(ToolHangExpert(world.spec), at, lambda: shift(world, name, by))
-    assert successes(world, policy, 42, 10) >= 8
+    policy = Meddled(ToolHangExpert(world.spec), once(at, lambda _: shift(world, name, by)))
+    assert successes(world, policy, 42, 10, HORIZON) >= 8
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("at", [10, 60, 140])
 def test_it_recovers_from_random_actions(world, at) -> None:
     """While it reaches, while it carries the frame, and on its way to the tool."""
-    assert successes(world, Meddled(ToolHangExpert(world.spec), at, pushes=10), 42, 10) >= 7
+    assert successes(world, Meddled(ToolHangExpert(world.spec), pushed(world, at)), 42, 10, HORIZON) >= 7
 
 
 @pytest.mark.slow
 def test_every_speed_and_grasp_succeeds_under_noise(world) -> None:
     expert = ToolHangExpert(world.spec, ExpertStyle(speed=(0.6, 1.0), approach="any"))
-    assert successes(world, NoisyPolicy(expert, world.spec.labels["action"], scale=0.05), 44, 15) >= 12
+    assert successes(world, NoisyPolicy(expert, world.spec.labels["action"], scale=0.05), 44, 15, HORIZON) >= 12
 
 
 def test_the_same_observation_gives_the_same_action(world) -> None:
-    first, second = ToolHangExpert(world.spec), ToolHangExpert(world.spec)
-    seen = world.reset(np.random.default_rng(1))
-    for _ in range(150):
-        decision = first.act(seen)
-        np.testing.assert_array_equal(decision.action, decision.expert_action)
-        np.testing.assert_array_equal(decision.action, second.act(seen).action)
-        assert np.abs(decision.action).max() <= 1.0
-        seen = world.step(decision.action).observation
+    check_same_action(world, lambda: ToolHangExpert(world.spec), 150)
 
 
 def test_grips_mount_and_ring_are_where_the_expert_takes_them_to_be(world) -> None:

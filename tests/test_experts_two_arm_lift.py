@@ -5,12 +5,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lfd.core.errors import InputError
-from lfd.core.protocols import Decision
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.style import ExpertStyle
 from lfd.experts.two_arm_lift import BASE_YAW, GRASPS_M, HALF_TURN, TwoArmLiftExpert, _in_base
 from lfd.run.wilson import wilson_interval
-from lfd.worlds.rollout import episode_rng, rollout
+from tests.expert_trials import Meddled, check_same_action, once, pushed, successes
 
 
 @pytest.fixture(scope="module")
@@ -18,30 +17,6 @@ def world():
     from lfd import make_world
 
     return make_world("TwoArmLift", "panda", 20)
-
-
-def successes(world, policy, seed: int, episodes: int, horizon: int = 300) -> int:
-    return sum(
-        rollout(world, policy, [], episode_rng("eval", seed, i), horizon=horizon, hold_steps=10).success
-        for i in range(episodes)
-    )
-
-
-class Disturbed:
-    """The expert, with something happening at a step of its episode."""
-
-    name = "disturbed"
-
-    def __init__(self, expert, happens):
-        self.expert, self.happens = expert, happens
-
-    def reset(self, rng):
-        self.expert.reset(rng)
-        self.step, self.rng = 0, rng
-
-    def act(self, observation):
-        self.step += 1
-        return self.happens(self) or self.expert.act(observation)
 
 
 @pytest.mark.slow
@@ -58,36 +33,25 @@ def test_it_succeeds_with_noise_at_every_speed_and_with_every_grasp(world) -> No
 
 def test_the_expert_recovers_from_pushes(world) -> None:
     """Half a second of random actions of both arms, at any time: hands that let go, and a pot that falls."""
-
-    def push(me):
-        if me.step == 1:
-            me.at = me.rng.integers(5, 40)
-        return Decision(me.rng.uniform(-1, 1, 14)) if me.at <= me.step < me.at + 10 else None
-
-    assert successes(world, Disturbed(TwoArmLiftExpert(world.spec), push), 42, 20) >= 18
+    assert successes(world, Meddled(TwoArmLiftExpert(world.spec), pushed(world, (5, 40))), 42, 20) >= 18
 
 
 def test_the_expert_follows_a_pot_that_is_moved(world) -> None:
     """Turned and shifted while the hands come down on it."""
     pot = world._model.joint("pot_joint0").qposadr[0]
 
-    def move(me):
-        if me.step == 10:
-            qpos = world._data.qpos
-            qpos[pot : pot + 2] += me.rng.uniform(-0.03, 0.03, 2)
-            turned = Rotation.from_euler("z", me.rng.uniform(-0.4, 0.4))
-            quat = turned * Rotation.from_quat(qpos[pot + 3 : pot + 7], scalar_first=True)
-            qpos[pot + 3 : pot + 7] = quat.as_quat(scalar_first=True)
+    def move(rng) -> None:
+        qpos = world._data.qpos
+        qpos[pot : pot + 2] += rng.uniform(-0.03, 0.03, 2)
+        turned = Rotation.from_euler("z", rng.uniform(-0.4, 0.4))
+        quat = turned * Rotation.from_quat(qpos[pot + 3 : pot + 7], scalar_first=True)
+        qpos[pot + 3 : pot + 7] = quat.as_quat(scalar_first=True)
 
-    assert successes(world, Disturbed(TwoArmLiftExpert(world.spec), move), 44, 10) >= 9
+    assert successes(world, Meddled(TwoArmLiftExpert(world.spec), once(10, move)), 44, 10) >= 9
 
 
 def test_the_same_observation_gives_the_same_action(world) -> None:
-    first, second = TwoArmLiftExpert(world.spec), TwoArmLiftExpert(world.spec)
-    seen = world.reset(np.random.default_rng(1))
-    for _ in range(25):
-        seen = world.step(first.act(seen).action).observation
-    np.testing.assert_array_equal(first.act(seen).action, second.act(seen).action)
+    check_same_action(world, lambda: TwoArmLiftExpert(world.spec), 25)
 
 
 def test_the_bars_are_where_the_model_has_them(world) -> None:

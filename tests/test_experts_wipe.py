@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from lfd.core.errors import InputError
-from lfd.core.protocols import Decision
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.style import ExpertStyle
 from lfd.experts.wipe import YAWS, WipeExpert
 from lfd.run.wilson import wilson_interval
-from lfd.worlds.rollout import episode_rng, rollout
+from tests.expert_trials import Meddled, check_same_action, once, pushed, successes
+
+HORIZON = 400
 
 
 @pytest.fixture(scope="module")
@@ -19,65 +20,34 @@ def world():
     return make_world("Wipe", "panda", 20)
 
 
-def successes(world, policy, seed: int, episodes: int, horizon: int = 400) -> int:
-    return sum(
-        rollout(world, policy, [], episode_rng("eval", seed, i), horizon=horizon, hold_steps=10).success
-        for i in range(episodes)
-    )
-
-
-class Disturbed:
-    """The expert, with something happening at a step of its episode."""
-
-    name = "disturbed"
-
-    def __init__(self, expert, happens):
-        self.expert, self.happens = expert, happens
-
-    def reset(self, rng):
-        self.expert.reset(rng)
-        self.step, self.rng = 0, rng
-
-    def act(self, observation):
-        self.step += 1
-        return self.happens(self) or self.expert.act(observation)
-
-
 @pytest.mark.slow
 def test_wipe_succeeds_from_at_least_98_percent_of_200_starts(world) -> None:
-    found = successes(world, WipeExpert(world.spec), 41, 200)
+    found = successes(world, WipeExpert(world.spec), 41, 200, HORIZON)
     assert found >= 196, wilson_interval(found, 200)
 
 
 @pytest.mark.slow
 def test_it_succeeds_with_noise_at_every_speed_and_with_the_tool_either_way(world) -> None:
     expert = WipeExpert(world.spec, ExpertStyle(speed=(0.6, 1.0), approach="any"))
-    assert successes(world, NoisyPolicy(expert, world.spec.labels["action"], scale=0.1), 43, 20) >= 18
+    assert successes(world, NoisyPolicy(expert, world.spec.labels["action"], scale=0.1), 43, 20, HORIZON) >= 18
 
 
 @pytest.mark.slow
 def test_the_expert_recovers_from_pushes(world) -> None:
     """Half a second of random actions, at any time: the tool is tilted, pushed into the table and away from it."""
-
-    def push(me):
-        if me.step == 1:
-            me.at = me.rng.integers(5, 60)
-        return Decision(me.rng.uniform(-1, 1, 6)) if me.at <= me.step < me.at + 10 else None
-
-    assert successes(world, Disturbed(WipeExpert(world.spec), push), 42, 20) >= 18
+    assert successes(world, Meddled(WipeExpert(world.spec), pushed(world, (5, 60))), 42, 20, HORIZON) >= 18
 
 
 def test_the_expert_wipes_what_is_spilt_again(world) -> None:
     """Some of the dirt that was wiped is back, away from the tool."""
 
-    def spill(me):
-        if me.step == 40:
-            wiped = world._env.wiped_markers
-            for marker in wiped[:10]:
-                world._model.geom(marker.visual_geoms[0]).rgba[3] = 1.0
-            del wiped[:10]
+    def spill(rng) -> None:
+        wiped = world._env.wiped_markers
+        for marker in wiped[:10]:
+            world._model.geom(marker.visual_geoms[0]).rgba[3] = 1.0
+        del wiped[:10]
 
-    assert successes(world, Disturbed(WipeExpert(world.spec), spill), 44, 5) >= 5
+    assert successes(world, Meddled(WipeExpert(world.spec), once(40, spill)), 44, 5, HORIZON) >= 5
 
 
 def test_the_dirt_that_is_observed_is_the_dirt_that_robosuite_has_left(world) -> None:
@@ -104,11 +74,7 @@ def test_the_dirt_that_is_observed_is_the_dirt_that_robosuite_has_left(world) ->
 
 
 def test_the_same_observation_gives_the_same_action(world) -> None:
-    first, second = WipeExpert(world.spec), WipeExpert(world.spec)
-    seen = world.reset(np.random.default_rng(1))
-    for _ in range(25):
-        seen = world.step(first.act(seen).action).observation
-    np.testing.assert_array_equal(first.act(seen).action, second.act(seen).action)
+    check_same_action(world, lambda: WipeExpert(world.spec), 25)
 
 
 def test_a_tool_that_is_tilted_is_lifted(world) -> None:

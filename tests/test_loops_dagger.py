@@ -24,7 +24,9 @@ from lfd.loops.dagger import CURVE, dagger
 from lfd.loops.dagger_recipe import DATA_TABLES, LEARN_TABLES, LoopRecipes
 from lfd.loops.dagger_round import PER_ROUND, STAGE, counts_of, members, round_folder, wave
 from lfd.policies.acting import LearnedPolicy
+from lfd.record.columns import arrays
 from lfd.record.episode_file import read_episode
+from lfd.record.mcap_file import read_mcap
 from lfd.worlds.rollout import episode_rng
 from tests.conftest import LIFT, ROOT
 
@@ -114,6 +116,9 @@ def test_the_dataset_holds_what_the_expert_said_in_the_states_that_the_learner_v
         np.testing.assert_allclose(labels_in(episode), meant, atol=1e-9)
         applied = np.array([decision.action for decision in learner.act_many(seen)])
         np.testing.assert_allclose(episode.actions, applied, atol=1e-5)
+        names, proposed = arrays([data for _, data in read_mcap(file).messages["/policy/action"]])
+        assert names == lift_world.spec.labels["action"]
+        np.testing.assert_allclose(proposed, applied, atol=1e-5)
         assert not episode.interventions.any()
         assert (episode.metadata.stage, episode.metadata.policy) == ("dagger", "bc_mlp")
 

@@ -55,6 +55,7 @@ def test_the_same_seed_gives_the_same_weights(thread, tmp_path) -> None:
     assert weights(tmp_path / "three") != weights(tmp_path / "one")
 
 
+@pytest.mark.slow
 def test_a_killed_training_that_is_gone_on_with_ends_in_the_same_weights(thread, tmp_path) -> None:
     """SIGKILL somewhere after the first checkpoint, then --resume, with an average and validation in play."""
     extra = [
@@ -96,21 +97,21 @@ def test_a_killed_training_that_is_gone_on_with_ends_in_the_same_weights(thread,
     assert not training_folder(out).exists()
 
 
-def test_going_on_needs_a_checkpoint_of_the_same_recipe(thread, tmp_path, monkeypatch) -> None:
+def test_going_on_needs_a_checkpoint_of_the_same_recipe(thread, tmp_path) -> None:
     with pytest.raises(OutputError, match="holds no checkpoint to go on with; leave --resume out to begin"):
         run(thread, tmp_path / "policy", recipe(steps=3), resume=True)
-    used = recipe(steps=40, checkpoint_every=10)
+    used = recipe(steps=40, checkpoint_every=10, judge_every=15, judge_episodes=1)
 
-    def interrupted(*args, **kwargs):
-        raise KeyboardInterrupt
+    def interrupted(folder: Path) -> float:
+        raise KeyboardInterrupt  # after the first checkpoint
 
-    monkeypatch.setattr("lfd.train.behavior_cloning.write_metrics", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        run(thread, tmp_path / "policy", used)
+        run(thread, tmp_path / "policy", used, judge=interrupted)
     with pytest.raises(OutputError, match=r"was trained with train = .*'steps': 40.*now it is .*'steps': 50"):
         run(thread, tmp_path / "policy", replace(used, steps=50), resume=True)
 
 
+@pytest.mark.slow
 def test_two_processes_take_the_steps_of_one(thread, tmp_path) -> None:
     """torchrun: each process has half of every batch, and the gradients are averaged."""
     from safetensors.torch import load_file

@@ -110,6 +110,9 @@ def make_dataset(root: Path, episodes: int, seed: int) -> None:
             writer.add(prepare(frames, VideoRecipe()))
 
 
+PROGRAMS = Path(__file__).with_name("peers")
+
+
 @contextmanager
 def _sides(
     root: Path, python: Path | None, hidden_sizes: tuple[int, ...], batch_size: int
@@ -120,7 +123,9 @@ def _sides(
     with ExitStack() as stack:
         if python is not None:
             for name, (program, rows) in PEERS.items():
-                peer = Peer(python, program, root.parent / rows, hidden_sizes=hidden_sizes, batch_size=batch_size)
+                peer = Peer(
+                    python, PROGRAMS / program, root.parent / rows, hidden_sizes=hidden_sizes, batch_size=batch_size
+                )
                 sides[name] = stack.enter_context(peer)
         yield sides
 

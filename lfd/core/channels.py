@@ -82,6 +82,8 @@ CHANNELS: dict[str, Channel] = {row.name: row for row in (
     _row("sim_state", "MuJoCo's mjSTATE_INTEGRATION", "mixed", "model", "/sim/state", ARRAY, "data", None, ""),
     _row("action", "action that was applied", "controller", "controller", "/action", ARRAY, "data", "action", "plots/action/applied"),
     _row("expert_action", "action that the expert proposed", "controller", "controller", "/expert/action", ARRAY, "data", "expert_action", "plots/action/expert"),
+    _row("policy_action", "action that the learner proposed", "controller", "controller", "/policy/action", ARRAY, "data", None, "plots/action/policy"),
+    _row("gate", "what a gate measured when it decided who acts", "mixed", "task", "/gate", ARRAY, "data", None, "plots/gate"),
     _row("teleop_axes", "what a person's device said, before gains", "1", "device", "/teleop/axes", ARRAY, "data", None, "plots/teleop/axes"),
     _row("pace", "how late the step began, in a recording in real time", "s", "clock", "/pace", ARRAY, "data", None, "plots/pace"),
     _row("reward", "reward of the step", "1", "task", "/step", ARRAY, "reward", "next.reward", "plots/step/reward"),

@@ -38,16 +38,21 @@ def who_acts(
     expert: BatchPolicy,
     learners: Sequence[BatchPolicy],
     recordings: Sequence[Sequence[Path]],
+    names: Sequence[str],
 ) -> BatchPolicy:
-    """pi_i; `recordings` are those of each round so far, from which a gate is made."""
+    """pi_i; `recordings` are those of each round so far, from which a gate is made.
+
+    `names` are those of the action's components, by which the learner's proposals go on record.
+    """
     recipe, learner = recipes.dagger, Ensemble(learners)
     if recipe.gate == "none":
-        return MixturePolicy(expert, learners[0] if len(learners) == 1 else learner, beta, per=recipe.per)
+        one = learners[0] if len(learners) == 1 else learner
+        return MixturePolicy(expert, one, beta, per=recipe.per, names=names)
     convert = recipes.source.convert()
     channels = (*convert.state, *convert.environment_state)
     visits = [[visit(learner, file, channels) for file in files] for files in recordings]
     gate = GATE_MAKERS[recipe.gate](recipes, visits, channels)
-    return GatedPolicy(expert, learner, gate)
+    return GatedPolicy(expert, learner, gate, names=names)
 
 
 @dataclass(frozen=True)
@@ -130,7 +135,7 @@ def _labelled(
     for each in (each for of_round in visits for each in of_round):
         if each.episode.expert_actions is None:
             continue
-        asked = ~np.isnan(each.episode.expert_actions).all(axis=1)
+        asked = each.episode.labelled
         states.append(each.states[:-1][asked])
         proposals.append(each.proposals[:-1][asked].mean(axis=1))
         labels.append(each.episode.expert_actions[asked])

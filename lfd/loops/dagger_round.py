@@ -145,7 +145,7 @@ class Round:
         learners = [learner_of(folder, self.recipes.tried, self.worlds) for folder in members(before, self.recipes)]
         rounds = [round_folder(self.out, number) / "recordings" for number in range(self.number)]
         recordings = [sorted(folder.glob(f"*{SUFFIX}")) for folder in rounds]
-        return who_acts(self.recipes, self.beta, expert, learners, recordings)
+        return who_acts(self.recipes, self.beta, expert, learners, recordings, self.worlds[0].spec.labels["action"])
 
     def _budget(self) -> int | None:
         """Labels that the round may use; none for as many as its rollouts take."""

@@ -69,7 +69,7 @@ def sweep(
     """
     made = combinations(recipe, varied)
     check_output(out, overwrite=overwrite)
-    load_frames(dataset)  # one that cannot be used shows before anything is touched
+    load_frames(dataset, images=False)  # one that cannot be used shows before anything is touched
     out.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
     with progress("sweep", len(made)) as bar:

@@ -7,6 +7,7 @@ raw numbers, a head (`lfd.policies.heads`) makes an action or a distribution of 
 the last n observations; at one or each of them (positions P) it predicts the next C actions (a chunk).
 """
 
+from abc import abstractmethod
 from collections import deque
 from itertools import pairwise
 from typing import Any
@@ -49,9 +50,10 @@ class CloningPolicy(PreTrainedPolicy):
         self.raw_size = config.chunk_size * self.head.width
         self.reset()
 
+    @abstractmethod
     def network(self, embedded: Float[Tensor, "B n F"]) -> Float[Tensor, "B P _"]:
         """Raw numbers of a chunk of actions, for the last positions of the window."""
-        raise NotImplementedError
+        ...
 
     @property
     def is_memoryless(self) -> bool:

@@ -15,14 +15,15 @@ from typing import Any
 
 import torch
 
-from lfd.core.artifact import check_output, new_folder, read_manifest, sha256, write_manifest
+from lfd.core.artifact import check_output, heal, new_folder, read_manifest, sha256, write_manifest
 from lfd.core.errors import DatasetError, OutputError
 from lfd.core.protocols import Progress, silent
 from lfd.core.recipe import as_table
 from lfd.data.frames import Frames, load_frames
 from lfd.policies.acting import about_policy, load_policy
 from lfd.policies.registry import make_policy
-from lfd.train.checkpoint import load_checkpoint, save_checkpoint, training_folder
+from lfd.policies.saving import save_policy
+from lfd.train.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint, training_folder
 from lfd.train.compatibility import check_policy, check_robot
 from lfd.train.curves import loggers, write_metrics
 from lfd.train.descent import Descent
@@ -87,10 +88,7 @@ def train(
             parents = {str(dataset): sha256(dataset)}
 
             def write_policy(folder: Path) -> None:
-                weights = {key: value.clone() for key, value in policy.state_dict().items()}  # they share memory
-                policy.save_pretrained(folder, state_dict=weights)
-                before.save_pretrained(folder)
-                after.save_pretrained(folder)
+                save_policy(folder, policy, before, after)
                 facts = {"policy": policy_table["type"], **_facts(frames, about)}
                 write_manifest(folder, kind="policy", recipe=used, parents=parents, seed=recipe.seed, **facts)
 
@@ -172,9 +170,10 @@ def _check_place(out: Path, *, resume: bool, overwrite: bool) -> None:
     """Refuse a place where a policy or an interrupted training is, before any work is done."""
     check_output(out, overwrite=overwrite)
     folder = training_folder(out)
+    heal(folder / CHECKPOINT)
     if resume or not folder.is_dir():
         return
-    if not overwrite:
+    if not overwrite and (folder / CHECKPOINT).is_dir():
         raise OutputError(
             f"{folder} holds a training that was interrupted: go on with it with --resume, or add --overwrite to begin "
             "anew"

@@ -11,9 +11,11 @@ from typing import Any
 
 from lfd.core.artifact import new_folder, write_json
 from lfd.core.errors import OutputError
+from lfd.policies.saving import save_tensors
 from lfd.train.descent import Descent
 from lfd.train.fitting import Course, course_of, plain_of, tensors_of
 
+CHECKPOINT = "checkpoint"
 STATE, COURSE = "training_state.safetensors", "training_course.json"
 
 
@@ -26,12 +28,10 @@ def save_checkpoint(
     out: Path, descent: Descent, course: Course, recipe: Mapping[str, Any], write_policy: Callable[[Path], None]
 ) -> None:
     """Keep the present state of a training; `recipe` is what it must be gone on with."""
-    from safetensors.torch import save_file
-
-    with new_folder(training_folder(out) / "checkpoint", overwrite=True) as part:
+    with new_folder(training_folder(out) / CHECKPOINT, overwrite=True) as part:
         with descent.averaged():
             write_policy(part)
-        save_file({**descent.state(), **tensors_of(course)}, part / STATE)
+        save_tensors(part / STATE, {**descent.state(), **tensors_of(course)})
         write_json(part / COURSE, {"recipe": dict(recipe), "course": plain_of(course)})
 
 
@@ -42,7 +42,7 @@ def load_checkpoint(out: Path, descent: Descent, recipe: Mapping[str, Any]) -> C
     """
     from safetensors.torch import load_file
 
-    folder = training_folder(out) / "checkpoint"
+    folder = training_folder(out) / CHECKPOINT
     if not (folder / STATE).is_file():
         raise OutputError(f"{folder} holds no checkpoint to go on with; leave --resume out to begin")
     kept = json.loads((folder / COURSE).read_text(encoding="utf-8"))

@@ -60,13 +60,12 @@ class Peer(AbstractContextManager["Peer"]):
     Raises `PeerError` when it ends before it should, with the last line that it wrote.
     """
 
-    def __init__(self, python: Path, program: str, rows: Path, *, hidden_sizes: Sequence[int], batch_size: int):
+    def __init__(self, python: Path, program: Path, rows: Path, *, hidden_sizes: Sequence[int], batch_size: int):
         options = json.dumps({"hidden_sizes": list(hidden_sizes), "batch_size": batch_size})
-        path = Path(__file__).with_name(program)
-        self._program = program
-        self._log = rows.with_name(f"{program}.log").open("w+", encoding="utf-8")
+        self._program = program.name
+        self._log = rows.with_name(f"{program.name}.log").open("w+", encoding="utf-8")
         self._process = subprocess.Popen(
-            [str(python), "-W", "ignore", str(path), str(rows), options],
+            [str(python), "-W", "ignore", str(program), str(rows), options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._log,
