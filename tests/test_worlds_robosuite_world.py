@@ -251,3 +251,13 @@ def test_unknown_names_list_the_known() -> None:
         UnknownName, match="unknown robot 'pandas'; known: baxter, iiwa, jaco, kinova3, panda, sawyer, ur5e."
     ):
         make_world("Lift", "pandas", 20)
+
+
+def test_a_world_asks_for_little_memory_and_the_heaviest_task_needs_less(rng) -> None:
+    world = make_world("ToolHang", "panda", 20)
+    data = world._env.sim.data._data
+    world.reset(rng)
+    for _ in range(20):
+        world.step(rng.uniform(-1, 1, len(world.spec.action_low)))
+    assert data.maxuse_arena < world._model.narena / 20
+    assert world._model.narena <= 64 * 2**20

@@ -18,6 +18,9 @@ HOLLOW_MESHES = {"Sawyer": ("_head_1", "_head_4"), "Baxter": ("_H1_1",)}
 LOCKING_CONTACTS = {"Sawyer": (("right_arm_base_link", "right_l0"),)}
 """Bodies whose contact is left out: a sphere of Sawyer's first link stands on the edge of its pedestal, which MuJoCo
 does not filter as it does neighbours that both move, and friction there locks the first joint."""
+ARENA = "64M"
+"""Memory for the contacts and constraints of a step. By robosuite's limits of 5000 contacts and 5000 constraints MuJoCo
+would set 1.2 GB aside for each MjData: never touched, but a process with some worlds is then refused a fork."""
 
 
 @cache
@@ -29,6 +32,8 @@ def import_robosuite() -> Any:
         import robosuite
         from robosuite.environments.base import MujocoEnv
         from robosuite.models import robots
+        from robosuite.models.world import MujocoWorldBase
+    _bound_arena(MujocoWorldBase)
     _remember_places(MujocoEnv)
     for robot, meshes in HOLLOW_MESHES.items():
         _amend(getattr(robots, robot), meshes, LOCKING_CONTACTS.get(robot, ()))
@@ -85,6 +90,17 @@ def _remember_places(environment: Any) -> None:
         self.places_in_xml = {field: getattr(self.sim.model._model, field).copy() for field in PLACED}
 
     environment._initialize_sim = initialize_and_remember
+
+
+def _bound_arena(world: Any) -> None:
+    """Let robosuite's worlds ask for `ARENA`."""
+    build = world.__init__
+
+    def build_bounded(self: Any) -> None:
+        build(self)
+        self.root.find("size").attrib = {"memory": ARENA}
+
+    world.__init__ = build_bounded
 
 
 def _amend(robot: Any, meshes: tuple[str, ...], contacts: tuple[tuple[str, str], ...]) -> None:
