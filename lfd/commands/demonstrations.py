@@ -104,7 +104,7 @@ def _record_person(given: Namespace, recipe: Any, tables: dict[str, Any]) -> Res
         raise InputError(f"a person moves one robot at a time: leave out {option}, or --device {given.device}")
     if not given.resume:
         check_output(given.out, overwrite=given.overwrite)
-    with open_device(given.device) as device, _live_view(not given.no_view) as view, closing(StatusLine()) as status:
+    with open_device(given.device) as device, live_view(not given.no_view) as view, closing(StatusLine()) as status:
         done = record_session(
             recipe,
             given.out,
@@ -120,14 +120,14 @@ def _record_person(given: Namespace, recipe: Any, tables: dict[str, Any]) -> Res
 
 
 @contextmanager
-def _live_view(wanted: bool) -> Iterator[Any]:
+def live_view(wanted: bool) -> Iterator[Any]:
     """What a person sees of the world, with a word on where; or nothing."""
     if not wanted:
         yield None
         return
-    from lfd.replay.live_view import live_view
+    from lfd.replay.live_view import live_view as opened
 
-    with live_view() as view:
+    with opened() as view:
         if view.address:
             print(
                 f"live view: {view.address}\n(over SSH: forward both ports, see docs/teleoperation.md)", file=sys.stderr

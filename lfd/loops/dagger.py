@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from lfd.core.artifact import check_output, new_folder, read_manifest, sha256, write_json, write_manifest
-from lfd.core.errors import OutputError
+from lfd.core.errors import InputError, OutputError
 from lfd.core.protocols import Progress, silent
 from lfd.experts.registry import check_expert
-from lfd.loops.dagger_recipe import LoopRecipes
+from lfd.loops.dagger_person import Person
+from lfd.loops.dagger_recipe import HUMAN, LoopRecipes
 from lfd.loops.dagger_round import REPORT, Round, Row, evaluated, round_folder
 from lfd.worlds.robosuite_world import EVERY_CORE, RobosuiteWorld, make_worlds
 
@@ -37,6 +38,7 @@ def dagger(
     out: Path,
     *,
     most_worlds: int = EVERY_CORE,
+    person: Person | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -48,9 +50,14 @@ def dagger(
     the most; the result does not depend on how many. With `resume` a loop goes on wherever it was interrupted, and ends
     with the same policy, bit for bit (on a CPU); it may then also run for more rounds.
 
-    Raises `OutputError` when `out` exists, or was made by another recipe, and what the stages raise.
+    With gate = "human" a `person` is the expert. Raises `OutputError` when `out` exists, or was made by another recipe,
+    `InputError` when the person quits or is missing, and what the stages raise.
     """
-    check_expert(recipes.record.task)
+    if (recipes.dagger.gate == HUMAN) != (person is not None):
+        raise InputError(f'gate = "{HUMAN}" and a person belong together: lfd dagger ... --device keyboard')
+    if person is None:
+        check_expert(recipes.record.task)
+    most_worlds = 1 if person is not None else most_worlds
     _begin(out, recipes, resume=resume, overwrite=overwrite)
     rows: list[Row] = []
     record, most = recipes.record, min(most_worlds, recipes.dagger.episodes_per_round)
@@ -60,7 +67,14 @@ def dagger(
         if rows and 0 < recipes.dagger.max_labels <= labels:
             break
         one = Round(
-            number=number, beta=beta, out=out, recipes=recipes, worlds=worlds, labels_before=labels, progress=progress
+            number=number,
+            beta=beta,
+            out=out,
+            recipes=recipes,
+            worlds=worlds,
+            labels_before=labels,
+            person=person,
+            progress=progress,
         )
         rows.append(one.run())
     best = max(rows, key=lambda row: (row.get("judged", 0.0), row["round"]))

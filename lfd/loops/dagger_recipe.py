@@ -21,10 +21,12 @@ EVALUATE = {
     "every": "the policy of every round is evaluated",
     "last": "only the policy that is handed over",
 }
+HUMAN = "human"
 GATES = {
     "none": "a coin decides who acts (beta), and the expert labels every step",
     "ensemble": "the expert acts where members disagree or are far from it, and labels every step",
     "safe": "the expert acts where a classifier expects the learner to err, and labels those steps (SafeDAgger)",
+    HUMAN: "a person takes over and hands back, and labels the steps in which they act (HG-DAgger)",
     "thrifty": "the expert takes over in new or risky states, until the two agree (ThriftyDAgger)",
 }
 
@@ -63,7 +65,8 @@ class DaggerRecipe:
     evaluate: str = "every"
     """Which policies are evaluated by [eval]: every (each round's) or last (the one that is handed over)."""
     gate: str = "none"
-    """What decides who acts: none (the coin), ensemble, safe or thrifty; docs/dagger.md compares them."""
+    """What decides who acts: none (the coin), ensemble, safe, thrifty, or with --device human; docs/dagger.md compares
+    them."""
     members: int = 1
     """Policies that each round trains, from other initial weights; a rollout's learner acts as their mean."""
     gate_share: float = 0.2
@@ -72,12 +75,17 @@ class DaggerRecipe:
     """Ensemble: distance from the expert's action beyond which the expert acts [action]; 0 does not ask for it."""
     gate_discount: float = 0.98
     """Thrifty: factor a step on the probability that the task will be solved."""
+    gate_rest_seconds: float = 0.5
+    """Human: rest of the device after which control goes back to the learner [s]; 0 leaves it to their word."""
 
     def check(self, where: str) -> None:
         for key in ("rounds", "demonstrations", "episodes_per_round", "warm_steps", "members"):
             if getattr(self, key) <= 0:
                 raise RecipeError(f"{where} {key} = {getattr(self, key)}: must be greater than 0")
-        for key in ("seed", "labels_per_round", "max_labels", "judge_episodes", "gate_distance", "rollout_seconds"):
+        for key in (
+            "seed", "labels_per_round", "max_labels", "judge_episodes", "gate_distance", "rollout_seconds",
+            "gate_rest_seconds",
+        ):  # fmt: skip
             if getattr(self, key) < 0:
                 raise RecipeError(f"{where} {key} = {getattr(self, key)}: must not be negative")
         for key in ("beta_rate", "gate_share", "gate_discount"):
@@ -92,6 +100,8 @@ class DaggerRecipe:
             raise RecipeError(f'{where} gate = "{self.gate}" compares members: set members = 3')
         if self.gate != "none" and not 0.0 < self.gate_share < 1.0:
             raise RecipeError(f"{where} gate_share = {self.gate_share}: a gate needs a share between 0 and 1")
+        if self.gate == HUMAN and (self.labels_per_round or self.max_labels):
+            raise RecipeError(f"{where} a person's episodes are not cut off: leave out labels_per_round and max_labels")
         if self.gate != "none" and self.beta != "first":
             raise RecipeError(f'{where} gate = "{self.gate}" takes the coin\'s place: leave beta = "first"')
 
@@ -133,7 +143,7 @@ class LoopRecipes:
                 f"{where} [convert] action = {convert['action']!r}: DAgger learns from the expert's labels, also where "
                 "the learner acted; set convert.action=expert_action"
             )
-        if dagger.gate != "none" and record.cameras:
+        if dagger.gate not in ("none", HUMAN) and record.cameras:
             raise RecipeError(
                 f'{where} gate = "{dagger.gate}" judges recorded numbers, not pictures: leave out cameras'
             )

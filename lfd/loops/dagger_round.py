@@ -19,6 +19,7 @@ from lfd.core.artifact import heal, read_manifest, sha256, write_json
 from lfd.core.protocols import BatchPolicy, Decision, Progress
 from lfd.experts.registry import make_expert
 from lfd.loops.dagger_control import learner_of, who_acts
+from lfd.loops.dagger_person import Person
 from lfd.loops.dagger_recipe import LoopRecipes
 from lfd.record.demonstrations import EPISODE, begin_recordings, numbers_in, record, take_cameras
 from lfd.record.episode_file import McapRecorder, Origin, episode_of
@@ -52,6 +53,8 @@ class Round:
     recipes: LoopRecipes
     worlds: Sequence[RobosuiteWorld]
     labels_before: int
+    person: Person | None
+    """The expert, where it is a person."""
     progress: Progress
 
     @property
@@ -92,7 +95,10 @@ class Round:
         """Round 0: beta = 1, the expert acts. As all demonstrations it does so with the noise of its recipe."""
         recipe = self.recipes.record
         begun = read_manifest(recordings) is not None
-        if begun and len(numbers_in(recordings, "$")) == recipe.episodes:
+        if begun and len(numbers_in(recordings, "$")) >= recipe.episodes:
+            return
+        if self.person is not None:
+            self.person.demonstrate(recipe, recordings, tables=self.recipes.tables, resume=begun)
             return
         record(
             recipe, recordings, tables=self.recipes.tables, most_worlds=len(self.worlds), resume=begun,
@@ -104,6 +110,9 @@ class Round:
         dagger, recipes = self.recipes.dagger, self.recipes
         if read_manifest(recordings) is None:
             begin_recordings(recordings, recipes.tables, dagger.seed)
+        if self.person is not None:
+            self._look_after(self.person, recordings)
+            return
         control, following, left = self._control(), 0, self._budget()
         with self.progress(f"round {self.number}", dagger.episodes_per_round) as bar:
             while following < dagger.episodes_per_round and (left is None or left > 0):
@@ -120,29 +129,53 @@ class Round:
 
     def _episodes(self, control: BatchPolicy, out: Path, numbers: Sequence[int], horizon: int) -> Iterator[bool]:
         """Run and record the episodes of some numbers; whether each was solved."""
-        recipes, waiting = self.recipes, iter(numbers)
-        seed = recipes.dagger.seed
+        waiting = iter(numbers)
 
         def next_start() -> Start | None:
             number = next(waiting, None)
             if number is None:
                 return None
-            index = self.number * PER_ROUND + number
-            origin = Origin(stage=STAGE, policy=control.name, seed=seed, index=index, recipe=recipes.tables)
-            recorder = McapRecorder(_file(out, number), origin, keep_failures=True)
-            return Start(index=index, rng=episode_rng(STAGE, seed, index), observers=[recorder])
+            recorder = self._recorder(out, control.name, number)
+            return Start(index=self._index(number), rng=self._generator(number), observers=[recorder])
 
-        ended = rollouts(self.worlds, control, next_start, horizon=horizon, hold_steps=recipes.record.hold_steps)
-        for _, outcome in ended:
+        hold_steps = self.recipes.record.hold_steps
+        for _, outcome in rollouts(self.worlds, control, next_start, horizon=horizon, hold_steps=hold_steps):
             yield outcome.success
+
+    def _look_after(self, person: Person, recordings: Path) -> None:
+        """Rollouts in a person's care; what they discard leaves a gap in the numbers."""
+        there, learners = numbers_in(recordings, "$"), self._learners()
+        wanted = self.recipes.dagger.episodes_per_round - len(there)
+        if wanted > 0:
+            person.look_after(
+                learners, self.worlds[0], self.recipes, self._generator,
+                lambda number: self._recorder(recordings, learners[0].name, number),
+                first=max(there, default=-1) + 1, wanted=wanted,
+            )  # fmt: skip
+
+    def _index(self, number: int) -> int:
+        """(stage, seed, index) decide the rollout with a number."""
+        return self.number * PER_ROUND + number
+
+    def _generator(self, number: int) -> np.random.Generator:
+        return episode_rng(STAGE, self.recipes.dagger.seed, self._index(number))
+
+    def _recorder(self, out: Path, policy: str, number: int) -> McapRecorder:
+        seed, tables = self.recipes.dagger.seed, self.recipes.tables
+        origin = Origin(stage=STAGE, policy=policy, seed=seed, index=self._index(number), recipe=tables)
+        return McapRecorder(_file(out, number), origin, keep_failures=True)
+
+    def _learners(self) -> list[BatchPolicy]:
+        """The policies of the round before."""
+        for world in self.worlds:
+            take_cameras(world, self.recipes.record)
+        before = round_folder(self.out, self.number - 1)
+        return [learner_of(folder, self.recipes.tried, self.worlds) for folder in members(before, self.recipes)]
 
     def _control(self) -> BatchPolicy:
         """pi_i: the expert and the policies of the round before, and what decides between them."""
-        for world in self.worlds:
-            take_cameras(world, self.recipes.record)
         expert = OneEach([make_expert(world.spec, self.recipes.record.style) for world in self.worlds])
-        before = round_folder(self.out, self.number - 1)
-        learners = [learner_of(folder, self.recipes.tried, self.worlds) for folder in members(before, self.recipes)]
+        learners = self._learners()
         rounds = [round_folder(self.out, number) / "recordings" for number in range(self.number)]
         recordings = [sorted(folder.glob(f"*{SUFFIX}")) for folder in rounds]
         return who_acts(self.recipes, self.beta, expert, learners, recordings, self.worlds[0].spec.labels["action"])

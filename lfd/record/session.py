@@ -15,8 +15,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from lfd.core.artifact import check_output
-from lfd.core.protocols import Observation, Observer, Progress, Transition, World, WorldState, silent
+from lfd.core.protocols import Observation, Observer, Policy, Progress, Transition, World, WorldState, silent
 from lfd.core.recipe import as_table
 from lfd.experts.device import Device
 from lfd.experts.keys import ACTING, WAITING, Word
@@ -99,83 +101,107 @@ def record_session(
     policy = TeleopPolicy(device, world.spec, teleop)
     if not resume:
         begin_recordings(out, used, recipe.seed)
-    return _Sitting(recipe, out, used, world, device, policy, view, status).run(first)
+
+    def recorder(index: int) -> Observer:
+        return make_recorder(out, used, policy=policy.name, seed=recipe.seed, attempt=index, keep_failures=True)
+
+    sitting = Sitting(
+        world=world,
+        device=device,
+        policy=policy,
+        said=lambda: policy.word,
+        generator=lambda index: episode_rng(STAGE, recipe.seed, index),
+        recorder=recorder,
+        wanted=recipe.episodes,
+        counted=lambda session: session.successes,
+        view=view,
+        status=status,
+        horizon=recipe.horizon,
+        hold_steps=recipe.hold_steps,
+        longer="--set record.max_seconds=60",
+    )
+    return sitting.run(first)
 
 
-class _Sitting:
-    """A session while it goes on."""
+@dataclass(frozen=True, kw_only=True)
+class Sitting:
+    """A person at a robot: what they sit before, and what becomes of their episodes."""
 
-    def __init__(
-        self,
-        recipe: RecordRecipe,
-        out: Path,
-        used: Mapping[str, Any],
-        world: World,
-        device: Device,
-        policy: TeleopPolicy,
-        view: View | None,
-        status: Status,
-    ):
-        self._recipe, self._out, self._used, self._world = recipe, out, used, world
-        self._device, self._policy, self._view, self._status = device, policy, view, status
-        self._paced, self._session = Paced(policy, recipe.control_hz), Session()
+    world: World
+    device: Device
+    policy: Policy
+    """What acts: the person, or somebody whom they look after."""
+    said: Callable[[], Word | None]
+    """What the person said to end the last episode."""
+    generator: Callable[[int], np.random.Generator]
+    """Start states: that of the episode with a number."""
+    recorder: Callable[[int], Observer]
+    """Keeps the episode with a number."""
+    wanted: int
+    """Episodes after which the sitting ends."""
+    counted: Callable[[Session], int]
+    """Which of the episodes so far count."""
+    view: View | None
+    status: Status
+    horizon: int
+    """Control steps after which an episode ends."""
+    hold_steps: int
+    longer: str
+    """What to type for longer episodes."""
 
     def run(self, index: int) -> Session:
-        session, said = self._session, ""
+        """Episodes from number `index` on, until none is wanted or the person quits."""
+        session, said = Session(), ""
+        paced = Paced(self.policy, self.world.spec.control_hz)
         start = self._draw(index)
-        while session.successes < self._recipe.episodes and self._started(index, said):
-            outcome = self._episode(index, start)
-            word = self._policy.word
-            said = self._count(outcome, word)
+        while self._goes_on(session) and self._started(index, said + self._kept(session)):
+            outcome, word = self._episode(paced, index, start), self.said()
+            said = self._count(session, outcome, word)
             if word is Word.QUIT:
                 break
             if word is Word.REDO:
-                self._world.set_state(start)
+                self.world.set_state(start)
                 self._show()
-            elif session.successes < self._recipe.episodes:
+            elif self._goes_on(session):
                 index += 1
                 start = self._draw(index)
-        session.pace = asdict(self._paced.summary())
+        session.pace = asdict(paced.summary())
         return session
 
     def _draw(self, index: int) -> WorldState:
         """Bring the world to start state number `index`, before the person starts, so that they see it."""
-        self._world.reset(episode_rng(STAGE, self._recipe.seed, index))
+        self.world.reset(self.generator(index))
         self._show()
-        return self._world.get_state()
+        return self.world.get_state()
 
     def _show(self) -> None:
-        if self._view is not None:
-            self._view.show(self._world)
+        if self.view is not None:
+            self.view.show(self.world)
 
-    def _started(self, index: int, said: str) -> bool:
+    def _started(self, index: int, told: str) -> bool:
         """Wait for the person's start; whether they did not quit instead."""
         while True:
-            self._status(f"episode {index}: waiting", f"{said}{self._kept()}  {WAITING}")
-            words = self._device.read().words
+            self.status(f"episode {index}: waiting", f"{told}  {WAITING}")
+            words = self.device.read().words
             if Word.START in words or Word.QUIT in words:
                 return Word.QUIT not in words
-            time.sleep(1.0 / self._recipe.control_hz)
+            time.sleep(1.0 / self.world.spec.control_hz)
 
-    def _episode(self, index: int, start: WorldState) -> Outcome:
-        recipe = self._recipe
-        recorder = make_recorder(
-            self._out, self._used, policy=self._policy.name, seed=recipe.seed, attempt=index, keep_failures=True
-        )
-        watching = [self._view] if self._view is not None else []
+    def _episode(self, paced: Paced, index: int, start: WorldState) -> Outcome:
+        watching = [self.view] if self.view is not None else []
+        clock = _Clock(index, self.world.spec.control_hz, self.horizon, self.status)
         return rollout(
-            self._world,
-            self._paced,
-            [recorder, *watching, _Clock(index, recipe, self._status)],
-            episode_rng(STAGE, recipe.seed, index),
-            horizon=recipe.horizon,
-            hold_steps=recipe.hold_steps,
+            self.world,
+            paced,
+            [self.recorder(index), *watching, clock],
+            self.generator(index),
+            horizon=self.horizon,
+            hold_steps=self.hold_steps,
             start=start,
         )
 
-    def _count(self, outcome: Outcome, word: Word | None) -> str:
+    def _count(self, session: Session, outcome: Outcome, word: Word | None) -> str:
         """Count an episode; what to tell the person about it."""
-        session = self._session
         session.steps += outcome.steps
         if word is Word.REDO:
             session.redone += 1
@@ -188,25 +214,29 @@ class _Sitting:
             return "success.  "
         session.failures += 1
         if word is None and not outcome.failure:
-            return f"failure: {self._recipe.max_seconds:g} s are over; --set record.max_seconds=60 gives more.  "
+            seconds = self.horizon / self.world.spec.control_hz
+            return f"failure: {seconds:g} s are over; {self.longer} gives more.  "
         return f"failure{outcome.failure and f': {outcome.failure}'}.  "
 
-    def _kept(self) -> str:
-        return f"{self._session.successes} of {self._recipe.episodes} recorded, {self._session.failures} failures"
+    def _kept(self, session: Session) -> str:
+        return f"{self.counted(session)} of {self.wanted} recorded, {session.failures} failures"
+
+    def _goes_on(self, session: Session) -> bool:
+        return self.counted(session) < self.wanted
 
 
 class _Clock:
     """Tells the person how long an episode has lasted."""
 
-    def __init__(self, index: int, recipe: RecordRecipe, status: Status):
-        self._index, self._recipe, self._status = index, recipe, status
+    def __init__(self, index: int, control_hz: int, horizon: int, status: Status):
+        self._index, self._hz, self._horizon, self._status = index, control_hz, horizon, status
 
     def begin(self, world: World, observation: Observation) -> None:
         """The first step follows at once."""
 
     def step(self, world: World, transition: Transition) -> None:
-        gone = (transition.step + 1) / self._recipe.control_hz
-        self._status(f"episode {self._index}: moving", f"{gone:4.1f} of {self._recipe.max_seconds:g} s  {ACTING}")
+        gone, most = (transition.step + 1) / self._hz, self._horizon / self._hz
+        self._status(f"episode {self._index}: moving", f"{gone:4.1f} of {most:g} s  {ACTING}")
 
     def end(self, success: bool) -> None:
         """The session tells how it ended."""
