@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from lfd.core.errors import RecipeError, UnknownName
-from lfd.loops.sweep import combinations, sweep
-from tests.conftest import BC
+from lfd.loops.sweep import combinations, rows_of, sweep, title_of
+from tests.conftest import BC, LIFT
+from tests.test_loops_dagger import DAGGER_LIFT
 
 
 @pytest.mark.slow
@@ -27,6 +28,34 @@ def test_a_sweep_gives_the_same_policies_and_episodes_on_a_cluster(thread, tmp_p
         reports = [json.loads((tmp_path / p / folder / "run" / "report.json").read_text()) for p in ("alone", "ray")]
         assert reports[0]["per_episode"] == reports[1]["per_episode"]
         assert (tmp_path / "ray" / folder / "policy" / "model.safetensors").is_file()
+
+
+@pytest.mark.slow
+def test_loops_are_swept_as_well(tmp_path) -> None:
+    recipe = tmp_path / "recipe.toml"
+    text = DAGGER_LIFT.read_text()
+    for before, after in (
+        ("steps = 4000", "steps = 20"), ("[256, 256]", "[8]"), ("rounds = 7", "rounds = 2"),
+        ("demonstrations = 10", "demonstrations = 1"), ("episodes_per_round = 10", "episodes_per_round = 1"),
+        ("episodes = 50", "episodes = 2"), ("max_seconds = 10.0", "max_seconds = 1.0"),
+        ("rollout_seconds = 4.0", "rollout_seconds = 1.0"),
+    ):  # fmt: skip
+        assert before in text
+        text = text.replace(before, after)
+    recipe.write_text(text)
+    rows = sweep(recipe, ["train.seed=[0, 1]"], LIFT, tmp_path / "out")
+    assert all(row["labels"] > 20 for row in rows)
+    assert len({row["loss"] for row in rows}) == 2
+    assert {path.name for path in (tmp_path / "out" / "001").iterdir()} == {
+        "policy",
+        "report.json",
+        "learning_curve.png",
+    }
+    assert title_of(recipe, LIFT) == "DAgger: recipe on Lift with panda"
+    assert f"{rows[0]['labels']} labels" in rows_of(rows)[f"train.seed {rows[0]['train.seed']}"]
+    with pytest.raises(RecipeError, match="a dataset recipe, not a dataset"):
+        sweep(recipe, ["train.seed=[0]"], tmp_path, tmp_path / "other")
+    assert not (tmp_path / "other").exists()
 
 
 def test_all_combinations_are_made() -> None:

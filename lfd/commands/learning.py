@@ -128,7 +128,10 @@ def _sweep(commands: Commands) -> None:
         "lfd sweep policies/bc_mlp.toml --dataset outputs/dataset --vary train.seed=[0,1,2] --out outputs/sweep",
     )
     made.add_argument("recipe", type=Path, metavar="RECIPE", help="policy recipe: [policy], [train] and [eval] tables")
-    made.add_argument("--dataset", type=Path, required=True, metavar="DATASET", help="LeRobot dataset folder")
+    made.add_argument(
+        "--dataset", type=Path, required=True, metavar="DATASET",
+        help="LeRobot dataset folder; for a recipe with a [dagger] table the dataset recipe of its loop",
+    )  # fmt: skip
     made.add_argument(
         "--vary", action="append", required=True, metavar="TABLE.KEY=[VALUE,VALUE]",
         help="values to try for a key of the recipe; may be repeated, all combinations are made",
