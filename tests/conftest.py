@@ -26,6 +26,21 @@ CHECKED = (
     "policies",
     "run",
     "replay",
+    "rewards",
+    "planning.arm_model",
+    "planning.arm_planner",
+    "planning.bellman",
+    "planning.demonstrations",
+    "planning.dynamics",
+    "planning.grid_worlds",
+    "planning.highway",
+    "planning.scenes",
+    "planning.tabular_mdp",
+    "planning.trajectory_costs",
+    "reward_learning.hull",
+    "reward_learning.margin_loop",
+    "reward_learning.maxent_sampled",
+    "reward_learning.maxent_tabular",
 )
 install_import_hook([f"lfd.{name}" for name in CHECKED], "beartype.beartype")
 
