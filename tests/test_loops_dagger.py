@@ -183,6 +183,14 @@ def normaliser(policy: Path) -> dict[str, list[float]]:
     return {key: torch.flatten(value).tolist() for key, value in load_file(file).items()}
 
 
+def test_the_last_round_may_train_longer_from_new_weights(tmp_path) -> None:
+    warm = ("dagger.retrain=warm", "dagger.warm_steps=10", "dagger.rounds=3", "dagger.last_steps=70")
+    report = dagger(recipes(*warm), tmp_path / "out")
+    assert [row["gradient_steps"] for row in report["rounds"]] == [50, 10, 70]
+    with pytest.raises(OutputError, match=r"dagger\.rounds = 3, the recipe says 4"):
+        dagger(recipes(*warm, "dagger.rounds=4"), tmp_path / "out", resume=True)
+
+
 def test_labels_end_where_the_budgets_say(tmp_path) -> None:
     budgets = ("dagger.rounds=4", "dagger.labels_per_round=30", "dagger.episodes_per_round=100")
     demonstrated = dagger(recipes("dagger.rounds=1"), tmp_path / "first")["labels"]

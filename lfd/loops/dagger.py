@@ -29,7 +29,7 @@ from lfd.loops.dagger_round import REPORT, Round, Row, evaluated, round_folder
 from lfd.worlds.robosuite_world import EVERY_CORE, RobosuiteWorld, make_worlds
 
 MAY_GROW = ("rounds", "max_labels")
-"""Keys of [dagger] that may differ when a loop is gone on with, unless beta is linear, which depends on the rounds."""
+"""Keys of [dagger] that may differ when a loop is gone on with, unless something depends on the number of rounds."""
 CURVE = "learning_curve.png"
 
 
@@ -101,7 +101,7 @@ def _check_same(out: Path, recipes: LoopRecipes) -> None:
     manifest = read_manifest(out) if out.is_dir() else None
     if manifest is None or manifest.get("kind") != "dagger":
         raise OutputError(f"{out} holds no loop to go on with; leave --resume out to begin there")
-    may_grow = () if recipes.dagger.beta == "linear" else MAY_GROW
+    may_grow = () if recipes.dagger.beta == "linear" or recipes.dagger.last_steps else MAY_GROW
     for name, now in recipes.tables.items():
         before = manifest["recipe"].get(name, {})
         for key in dict.fromkeys([*before, *now]):

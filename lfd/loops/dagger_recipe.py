@@ -60,6 +60,9 @@ class DaggerRecipe:
     """What a round trains: scratch (all [train] steps from new weights) or warm (`warm_steps` from the last ones)."""
     warm_steps: int = 1000
     """Gradient steps of a round that goes on from the weights of the round before."""
+    last_steps: int = 0
+    """Gradient steps of the last round, from new weights: warm rounds collect cheaply, the last one learns thoroughly;
+    0 trains it as the others."""
     judge_episodes: int = 0
     """Rollouts, on start states of their own, by which the best round's policy is chosen; 0 takes the last round's."""
     evaluate: str = "every"
@@ -83,8 +86,8 @@ class DaggerRecipe:
             if getattr(self, key) <= 0:
                 raise RecipeError(f"{where} {key} = {getattr(self, key)}: must be greater than 0")
         for key in (
-            "seed", "labels_per_round", "max_labels", "judge_episodes", "gate_distance", "rollout_seconds",
-            "gate_rest_seconds",
+            "seed", "labels_per_round", "max_labels", "last_steps", "judge_episodes", "gate_distance",
+            "rollout_seconds", "gate_rest_seconds",
         ):  # fmt: skip
             if getattr(self, key) < 0:
                 raise RecipeError(f"{where} {key} = {getattr(self, key)}: must not be negative")

@@ -197,9 +197,11 @@ class Round:
 
     def _retrain(self) -> tuple[int, float]:
         """Retrain every member on D; gradient steps of all of them, and the first one's loss."""
-        recipe, warm = self.recipes.train, self.number > 0 and self.recipes.dagger.retrain == "warm"
-        if warm:
-            recipe = replace(recipe, steps=self.recipes.dagger.warm_steps)
+        recipe, dagger = self.recipes.train, self.recipes.dagger
+        last = dagger.last_steps > 0 and self.number == dagger.rounds - 1
+        warm = self.number > 0 and dagger.retrain == "warm" and not last
+        if warm or last:
+            recipe = replace(recipe, steps=dagger.last_steps if last else dagger.warm_steps)
         before = members(round_folder(self.out, self.number - 1), self.recipes) if warm else ()
         done = []
         for number, folder in enumerate(members(self.folder, self.recipes)):

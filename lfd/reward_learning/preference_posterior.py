@@ -146,14 +146,15 @@ class PreferencePosterior:
         return np.maximum(self._each(self._weights(states), count), VIOLATED).sum(axis=0)
 
     def _advance(self) -> None:
-        """Take new answers in one by one: reweight, resample, move. Then move on."""
+        """Take new answers in one by one: reweight, resample, move. Where there are none, move on."""
+        if self._filtered == len(self):
+            self._move(len(self))
         for count in range(self._filtered + 1, len(self) + 1):
             gain = self._bounded(self._states, count) - self._bounded(self._states, count - 1)
             chances = np.exp(gain - gain.max())
             self._states = self._states[_systematic(chances / chances.sum(), self._rng)]
             self._move(count)
         self._filtered = len(self)
-        self._move(len(self))
 
     def _move(self, count: int) -> None:
         def target(states: np.ndarray) -> np.ndarray:
