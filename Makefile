@@ -28,6 +28,7 @@ results: $(READY)
 	$(BIN)/lfd bench train --results docs/results.md
 	$(BIN)/lfd bench compounding --results docs/results.md
 	$(BIN)/lfd bench dagger --results docs/results.md
+	$(BIN)/lfd bench irl --results docs/results.md
 	$(BIN)/lfd experts --episodes 50 --results docs/results.md
 
 pictures: $(READY)

@@ -1,7 +1,8 @@
+import numpy as np
 import pytest
 
-from lfd.core.channels import CHANNELS, channel
-from lfd.core.errors import UnknownName
+from lfd.core.channels import CHANNELS, channel, observed
+from lfd.core.errors import RecipeError, UnknownName
 
 
 def test_objects_are_filled_in() -> None:
@@ -20,6 +21,20 @@ def test_each_kind_of_channel_with_a_blank_is_found_by_its_ending() -> None:
     assert channel("robot1_ee_quat").feature == "observation.state"
     assert channel("Door_qpos").topic == "/objects/Door/joints"
     assert channel("handle_point").path == "plots/objects/handle/point"
+
+
+def test_a_difference_is_a_channel_of_its_own() -> None:
+    row = channel("cube_pos - ee_pos")
+    assert (row.name, row.unit, row.feature) == ("cube_pos - ee_pos", "m", "observation.environment_state")
+    seen = {"cube_pos": np.array([1.0, 2.0, 3.0]), "ee_pos": np.array([0.5, 0.0, 4.0])}
+    np.testing.assert_array_equal(observed(seen, "cube_pos - ee_pos"), [0.5, 2.0, -1.0])
+    assert observed(seen, "ee_pos") is seen["ee_pos"]
+    with pytest.raises(
+        RecipeError, match=r"no difference of two channels .* cube_pos \[m, world\], ee_quat \[1, world\]"
+    ):
+        channel("cube_pos - ee_quat")
+    with pytest.raises(UnknownName, match="unknown channel 'hand'"):
+        channel("cube_pos - hand")
 
 
 def test_unknown_channel_lists_the_known() -> None:

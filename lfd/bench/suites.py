@@ -169,6 +169,45 @@ def _dagger(given: Namespace) -> tuple[Measured, Measured]:
     return asdict(measured), {f"DAgger: {given.task} by labels": rows_of(measured)}
 
 
+def _comparisons(given: Namespace) -> tuple[Measured, Measured]:
+    from pathlib import Path
+
+    from lfd.bench.comparisons import bench_comparisons, plot, rows_of
+
+    measured = bench_comparisons(
+        features=(4,) if given.quick else (4, 7, 10),
+        people=4 if given.quick else 30,
+        questions=10 if given.quick else 40,
+        seed=given.seed,
+        progress=progress_bar,
+    )
+    if given.results is not None:
+        plot(measured, Path("docs/pictures/comparisons.png"))
+    curves = {
+        case: {name: each.mean(axis=0).tolist() for name, each in found.items()}
+        for case, found in measured.alignment.items()
+    }
+    return {"people": measured.people, "mean_alignment": curves}, {"Comparisons": rows_of(measured)}
+
+
+def _irl(given: Namespace) -> tuple[Measured, Measured]:
+    from pathlib import Path
+
+    from lfd.bench.irl import bench_irl, plot, sections_of
+
+    measured = bench_irl(
+        size=16 if given.quick else 32,
+        counts=(4, 64) if given.quick else (4, 16, 64, 256, 1024),
+        seeds=range(given.seed, given.seed + (2 if given.quick else 10)),
+        grids=0 if given.quick else 3,
+        peer_size=30,
+        progress=progress_bar,
+    )
+    if given.results is not None:
+        plot(measured, Path("docs/pictures/inverse_rl.png"))
+    return asdict(measured), sections_of(measured)
+
+
 SUITES: dict[str, Suite] = {
     "sim": _sim,
     "cameras": _cameras,
@@ -177,5 +216,7 @@ SUITES: dict[str, Suite] = {
     "train": _train,
     "compounding": _compounding,
     "dagger": _dagger,
+    "irl": _irl,
+    "comparisons": _comparisons,
 }
 """Name to suite."""

@@ -85,7 +85,7 @@ def run_doctor(given: Namespace) -> Result:
     return {**marks, "failed": any(c.needed and not c.works for c in checks)}
 
 
-SUITES = ("sim", "cameras", "record", "convert", "train", "compounding", "dagger")
+SUITES = ("sim", "cameras", "record", "convert", "train", "compounding", "dagger", "comparisons", "irl")
 """Names of `lfd.bench.suites`, which is imported when one runs."""
 
 
@@ -95,7 +95,8 @@ def _bench(commands: Commands) -> None:
         run_bench,
         "measure side by side: sim (robosuite's step, ours, the physics alone), cameras (robosuite's, ours), record "
         "(with and without, writers, real time), convert (LeRobot's calls, ours), train (loading and gradient steps: "
-        "LeRobot, robomimic, imitation, ours), compounding (errors against the horizon), dagger (success by labels)",
+        "LeRobot, robomimic, imitation, ours), compounding (errors against the horizon), dagger (success by labels), "
+        "comparisons (alignment by answers), irl (three methods by demonstrations, imitation)",
         "lfd bench sim --quick",
     )
     made.add_argument("suite", choices=SUITES, help="what to measure")

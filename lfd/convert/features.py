@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lfd.convert.frames import EpisodeFrames, Pictures
-from lfd.core.channels import CHANNELS, ENVIRONMENT_STATE, STATE, channel
+from lfd.core.channels import CHANNELS, ENVIRONMENT_STATE, STATE, channel, observed, operands
 from lfd.core.episode import Episode
 from lfd.core.errors import DatasetError, RecipeError, UnknownName
 from lfd.core.recipe import as_table
@@ -28,7 +28,8 @@ class ConvertRecipe:
     state: tuple[str, ...]
     """Channels of the robot, in the order in which they make up observation.state."""
     environment_state: tuple[str, ...]
-    """Channels of the objects, in the order in which they make up observation.environment_state."""
+    """Channels of the objects, in the order in which they make up observation.environment_state; also differences of
+    two channels, such as `cube_pos - ee_pos`, where a millimetre is not small beside the size of the workspace."""
     action: str
     """What becomes the action to imitate: `expert_action`, as the expert meant it, or `action`, as it was applied."""
     cameras: tuple[str, ...] = ()
@@ -103,7 +104,7 @@ def _frames(episode: Episode, recipe: ConvertRecipe, source: str, notes: Mapping
     for feature, channels in ((STATE, recipe.state), (ENVIRONMENT_STATE, recipe.environment_state)):
         if channels or feature == STATE:
             names[feature], units[feature] = _components(episode, channels)
-            rows = [episode.observations[name][:-1] for name in channels]
+            rows = [observed(episode.observations, name)[:-1] for name in channels]
             columns[feature] = np.concatenate(rows, axis=1).astype(np.float32)
     columns["action"] = actions.astype(np.float32)
     names["action"] = episode.labels["action"]
@@ -138,10 +139,10 @@ def _frames(episode: Episode, recipe: ConvertRecipe, source: str, notes: Mapping
 
 def _components(episode: Episode, channels: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names of the components of joined channels, such as `ee_pos.x`, and their units."""
-    for name in channels:
+    for name in (part for each in channels for part in operands(each)):
         if name not in episode.labels:
             raise UnknownName("channel", name, episode.labels)
-    labels = [(name, label) for name in channels for label in episode.labels[name]]
+    labels = [(name, label) for name in channels for label in episode.labels[operands(name)[0]]]
     return tuple(f"{name}.{label}" for name, label in labels), tuple(channel(name).unit for name, _ in labels)
 
 

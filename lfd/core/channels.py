@@ -5,9 +5,11 @@ A channel's numbers at one time are a vector; the names of its components (joint
 world and are stored beside the data as `labels`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol, Self
 
-from lfd.core.errors import UnknownName
+from lfd.core.errors import RecipeError, UnknownName
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -19,6 +21,12 @@ ENVIRONMENT_STATE = "observation.environment_state"
 
 XYZ = ("x", "y", "z")
 WXYZ = ("w", "x", "y", "z")
+
+
+class SupportsDifference(Protocol):
+    """What can be subtracted from its like: arrays."""
+
+    def __sub__(self, other: Self, /) -> Self: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,11 +102,23 @@ CHANNELS: dict[str, Channel] = {row.name: row for row in (
 # fmt: on
 
 
+MINUS = " - "
+"""Between two channels: `cube_pos - ee_pos` is their difference, as datasets and policies may take it."""
+
+
 def channel(name: str) -> Channel:
     """The row of the channel called `name`, objects filled in: `channel("cube_pos").topic` is `/objects/cube/pose`.
 
-    Raises `UnknownName` for a name that no row matches.
+    A difference has the row of its first channel, whose unit and frame the second must share. Raises `UnknownName` for
+    a name that no row matches, `RecipeError` for a difference of unlike things.
     """
+    first, *others = operands(name)
+    if others:
+        rows = [channel(each) for each in (first, *others)]
+        if len(rows) != 2 or len({(row.unit, row.frame) for row in rows}) > 1:
+            told = ", ".join(f"{row.name} [{row.unit}, {row.frame}]" for row in rows)
+            raise RecipeError(f"{name!r} is no difference of two channels in the same unit and frame: {told}")
+        return replace(rows[0], name=name, meaning=f"{rows[0].meaning}, from {rows[1].name}")
     if name in CHANNELS and "{" not in name:
         return CHANNELS[name]
     for template, row in CHANNELS.items():
@@ -106,3 +126,14 @@ def channel(name: str) -> Channel:
         if suffix and blank.startswith("{") and name.endswith(suffix) and len(name) > len(suffix):
             return row.of(name)
     raise UnknownName("channel", name, CHANNELS)
+
+
+def operands(name: str) -> tuple[str, ...]:
+    """The channels that a name is read from: itself, or the two of a difference."""
+    return tuple(name.split(MINUS))
+
+
+def observed[Rows: SupportsDifference](observation: Mapping[str, Rows], name: str) -> Rows:
+    """A channel of an observation, or the difference of two. Raises `KeyError` for one that is not there."""
+    first, *others = operands(name)
+    return observation[first] - observation[others[0]] if others else observation[first]

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import UInt8
 
 from lfd.core.artifact import read_manifest
+from lfd.core.channels import operands
 from lfd.core.errors import PolicyError
 from lfd.core.protocols import Decision, Observation, WorldSpec
 from lfd.policies.adoption import about_foreign
@@ -116,7 +117,7 @@ class LearnedPolicy:
     def _batch(self, observations: Sequence[Observation], places: Sequence[int]) -> dict[str, torch.Tensor]:
         batch = {
             feature: torch.tensor(
-                [[seen[name][i] for name, i in sources] for seen in observations], dtype=torch.float32
+                [[_number(seen, *source) for source in sources] for seen in observations], dtype=torch.float32
             )
             for feature, sources in self._sources.items()
         }
@@ -201,8 +202,14 @@ def _with_own_memory(policy: Any) -> Any:
     return copy.deepcopy(policy, shared)
 
 
-def _source(component: str, spec: WorldSpec, folder: Path) -> tuple[str, int]:
+def _source(component: str, spec: WorldSpec, folder: Path) -> tuple[int, str, str | None]:
+    """Where a component is read: its index in a channel, and the channel that is subtracted if it is a difference."""
     name, _, label = component.partition(".")
-    if label not in spec.labels.get(name, ()):
+    first, *others = operands(name)
+    if any(label not in spec.labels.get(part, ()) for part in (first, *others)):
         raise PolicyError(f"{folder} needs the observation {component!r}, which {spec.task} with {spec.robot} lacks")
-    return name, spec.labels[name].index(label)
+    return spec.labels[first].index(label), first, others[0] if others else None
+
+
+def _number(seen: Observation, at: int, first: str, second: str | None) -> float:
+    return seen[first][at] if second is None else seen[first][at] - seen[second][at]

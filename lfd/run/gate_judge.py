@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from lfd.core.channels import observed
 from lfd.core.errors import TrainingError
 from lfd.core.protocols import Observation
 
@@ -88,4 +89,4 @@ def fit_judge(
 
 def features(observation: Observation, channels: Sequence[str]) -> Float[np.ndarray, "Do"]:
     """The channels that a judge sees, one after the other."""
-    return np.concatenate([observation[name] for name in channels])
+    return np.concatenate([observed(observation, name) for name in channels])

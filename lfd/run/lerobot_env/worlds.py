@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import concatenate
 from jaxtyping import Int, UInt8
 
-from lfd.core.channels import ENVIRONMENT_STATE, STATE
+from lfd.core.channels import ENVIRONMENT_STATE, STATE, operands
 from lfd.core.errors import InputError
 from lfd.core.processes import cores
 from lfd.run.lerobot_env.setting import Setting
@@ -61,7 +61,7 @@ class PolicyEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
                 f"{len(spec.action_low)}"
             )
         spaces: dict[str, gymnasium.Space] = {
-            key: Box(-BOUND, BOUND, columns.shape, np.float32) for key, columns in self._columns.items()
+            key: Box(-BOUND, BOUND, first.shape, np.float32) for key, (first, _) in self._columns.items()
         }
         if self._seen_cameras:
             self._take_cameras(setting.pictures)
@@ -104,20 +104,26 @@ class PolicyEnv(gymnasium.Env[dict[str, Any], np.ndarray]):
         self._has_cameras = True
 
     def _observe(self, vector: np.ndarray) -> dict[str, Any]:
-        seen: dict[str, Any] = {key: vector[columns].astype(np.float32) for key, columns in self._columns.items()}
+        seen: dict[str, Any] = {
+            key: (vector[first] - np.where(second < 0, 0.0, vector[second])).astype(np.float32)
+            for key, (first, second) in self._columns.items()
+        }
         if self._seen_cameras:
             seen["pixels"] = dict(self._arm.world.pictures())
         return seen
 
-    def _find(self, names: tuple[str, ...]) -> Int[np.ndarray, "_"]:
-        """Where components such as `ee_pos.x` stand in the world's observation."""
+    def _find(self, names: tuple[str, ...]) -> tuple[Int[np.ndarray, "_"], Int[np.ndarray, "_"]]:
+        """Where components such as `ee_pos.x` stand in the world's observation; of differences both, else -1."""
         spec, found = self._arm.world.spec, []
         for name in names:
             channel, _, label = name.partition(".")
-            if channel not in self._arm.layout or label not in spec.labels[channel]:
+            parts = operands(channel)
+            if any(part not in self._arm.layout or label not in spec.labels[part] for part in parts):
                 raise InputError(f"the dataset has {name!r}, which {spec.task} with {spec.robot} does not observe")
-            found.append(self._arm.layout[channel].start + spec.labels[channel].index(label))
-        return np.array(found, dtype=int)
+            places = [self._arm.layout[part].start + spec.labels[part].index(label) for part in parts]
+            found.append([*places, -1][:2])
+        first, second = np.array(found, dtype=int).reshape(-1, 2).T
+        return first, second
 
 
 class ThreadedWorlds(SyncVectorEnv):
