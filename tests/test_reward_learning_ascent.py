@@ -50,7 +50,7 @@ def test_the_domain_is_not_left() -> None:
 def test_without_a_maximum_it_stops_and_says_so() -> None:
     found = maximise(lambda x: (float(x.sum()), np.ones(2)), np.zeros(2), tolerance=1e-8, max_iterations=1000)
     assert not found.converged
-    assert found.iterations == 0
+    assert found.iterations < 10
     assert np.isfinite(found.point).all()
 
 

@@ -19,7 +19,9 @@ STEEP, OVERSHOT = 0.9, 0.5
 ROUNDING = 1e-10
 """A value that is lower by no more than this share counts as unchanged."""
 TRIES = 30
-"""Evaluations of one line search. Where the slope has not fallen by then, there is no maximum in that direction."""
+"""Evaluations of one line search."""
+REACH, FARTHEST = 10.0, 1e6
+"""A step goes at most REACH (1 + |x|) far; beyond FARTHEST there is taken to be no maximum."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,8 @@ def maximise(objective: Objective, start: Float[np.ndarray, "K"], *, tolerance: 
     for iteration in range(max_iterations):
         if np.linalg.norm(gradient) <= tolerance:
             return Ascent(point, value, gradient, iteration, True)
+        if np.linalg.norm(point) > FARTHEST:
+            return Ascent(point, value, gradient, iteration, False)
         direction = _direction(gradient, pairs)
         if direction @ gradient <= 0:  # rounding: the memory is of no use any more
             pairs.clear()
@@ -83,13 +87,14 @@ def _search(
     direction: Float[np.ndarray, "K"],
     first: float,
 ) -> tuple[Float[np.ndarray, "K"], float, Float[np.ndarray, "K"]] | None:
-    """A step along `direction` whose slope is nearly level; None where the slope never falls, however long the step.
+    """A step along `direction` whose slope is nearly level, or the longest one; None where no step is any good.
 
     The slope is bracketed between `low`, where it is positive, and `high`, where it is negative or the domain ends.
     """
     slope = float(gradient @ direction)
     low, low_slope, high, high_slope, best = 0.0, slope, np.inf, -np.inf, None
-    length = first
+    longest = REACH * (1.0 + float(np.linalg.norm(point))) / float(np.linalg.norm(direction))
+    length = min(first, longest)
     for _ in range(TRIES):
         there = point + length * direction
         there_value, there_gradient = objective(there)
@@ -98,13 +103,15 @@ def _search(
             high, high_slope = length, -np.inf
         elif there_slope > STEEP * slope:
             low, low_slope, best = length, there_slope, (there, there_value, there_gradient)
+            if length == longest:
+                return best
         elif there_slope < -OVERSHOT * slope or there_value < value - ROUNDING * abs(value):
             high, high_slope = length, there_slope
         else:
             return there, there_value, there_gradient
         if np.isinf(high):
-            length *= 4.0
+            length = min(4.0 * length, longest)
         else:
             share = low_slope / (low_slope - high_slope) if np.isfinite(high_slope) else 0.5
             length = low + min(max(share, 0.1), 0.9) * (high - low)
-    return None if np.isinf(high) else best
+    return best
