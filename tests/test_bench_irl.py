@@ -1,6 +1,5 @@
 """That the bench of inverse RL measures what it says, on grids that are small enough to check by hand."""
 
-import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from lfd.bench.irl_problems import (
 from lfd.bench.peers.process import PeerError, peers_folder
 from lfd.planning import StatesAndActions, log_likelihood
 from lfd.reward_learning import maxent_tabular
-from tests.conftest import ROOT, call_json
+from tests.conftest import call_json
 
 
 def small(seed: int = 0, discount: float = 0.9):
@@ -209,12 +208,3 @@ def test_imitation_finds_the_same_policy_and_needs_more_steps() -> None:
     shown = mdp.sample(expert, 500, np.random.default_rng(0))
     learned = ask_imitation(peers_folder() / "bin" / "python", evidence_of(mdp, shown).mdp, shown=shown)
     assert log_likelihood(mdp, learned.policy, pairs(shown)) > log_likelihood(mdp, uniform_policy(mdp), pairs(shown))
-
-
-def test_the_code_of_the_page_runs() -> None:
-    page = (ROOT / "docs" / "inverse_rl.md").read_text(encoding="utf-8")
-    pieces = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
-    assert len(pieces) >= 5
-    names: dict[str, object] = {}
-    for piece in pieces:
-        exec(piece, names)

@@ -131,3 +131,10 @@ def test_what_is_no_belief_is_said(table) -> None:
         boltzmann_likelihood(torch.tensor([[[0.0], [torch.nan]]]), rationality=1.0)
     with pytest.raises(InputError, match="finite bounds"):
         log_likelihood_quadrature(reward, torch.zeros(2, dtype=torch.float64), bounds=(-torch.inf, 1.0))
+
+
+def test_the_package_hands_on_functions_whatever_was_imported_before() -> None:
+    import lfd.interaction
+
+    for name in lfd.interaction.__all__:
+        assert callable(getattr(lfd.interaction, name)), name

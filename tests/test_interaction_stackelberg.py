@@ -4,7 +4,7 @@ import torch
 from scipy.optimize import minimize
 
 from lfd.core.errors import InputError
-from lfd.interaction.best_response import NoResponse, SingularResponse, best_response, response_jacobian
+from lfd.interaction.responses import NoResponse, SingularResponse, best_response, response_jacobian
 from lfd.interaction.stackelberg import leader_gradient, plan_stackelberg
 
 A = torch.tensor([[2.0, 0.3], [0.3, 1.0]], dtype=torch.float64)

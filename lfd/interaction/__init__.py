@@ -5,10 +5,10 @@ from typing import Any
 
 _PUBLIC = {
     "IntentBelief": "lfd.interaction.intent",
-    "NoResponse": "lfd.interaction.best_response",
+    "NoResponse": "lfd.interaction.responses",
     "Plan": "lfd.interaction.stackelberg",
-    "SingularResponse": "lfd.interaction.best_response",
-    "best_response": "lfd.interaction.best_response",
+    "SingularResponse": "lfd.interaction.responses",
+    "best_response": "lfd.interaction.responses",
     "boltzmann_likelihood": "lfd.interaction.intent",
     "information_gain": "lfd.interaction.information",
     "information_several_steps": "lfd.interaction.information",
@@ -17,7 +17,7 @@ _PUBLIC = {
     "log_likelihood_quadrature": "lfd.interaction.continuous_intent",
     "log_likelihood_samples": "lfd.interaction.continuous_intent",
     "plan_stackelberg": "lfd.interaction.stackelberg",
-    "response_jacobian": "lfd.interaction.best_response",
+    "response_jacobian": "lfd.interaction.responses",
 }
 
 __all__ = sorted(_PUBLIC)  # pyright: ignore[reportUnsupportedDunderAll]

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.func import hessian, vmap
 
 from lfd.core.errors import InputError
-from lfd.interaction.best_response import Bounds, best_response, limits
+from lfd.interaction.responses import Bounds, best_response, limits
 
 OwnReward = Callable[[Tensor], Tensor]
 """u_human to a scalar: R_H with state, u_robot and theta bound."""

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.func import grad, vjp
 
 from lfd.core.errors import InputError
-from lfd.interaction.best_response import Bounds, Reward, _vector, best_response, free_curvature, limits
+from lfd.interaction.responses import Bounds, Reward, _vector, best_response, free_curvature, limits
 
 
 @dataclass(frozen=True, kw_only=True)
