@@ -57,6 +57,7 @@ def _about_recipe(path: Path) -> dict[str, Any]:
     from lfd.convert.features import ConvertRecipe
     from lfd.convert.foreign.mapping import ResampleRecipe, map_recipe
     from lfd.loops.dagger_recipe import DaggerRecipe
+    from lfd.loops.plan_demonstrations import PlanRecipe
     from lfd.policies.registry import make_config
     from lfd.record.demonstrations import RecordRecipe
     from lfd.run.trial import EvalRecipe
@@ -73,6 +74,7 @@ def _about_recipe(path: Path) -> dict[str, Any]:
         "train": TrainRecipe,
         "eval": EvalRecipe,
         "dagger": DaggerRecipe,
+        "plan": PlanRecipe,
     }
     facts: dict[str, Any] = {"kind": "recipe"}
     tables = load_toml(path, (*kinds, "policy", "map"))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from lfd.commands import dagger, demonstrations, experts, learning, looking
+from lfd.commands import dagger, demonstrations, experts, learning, looking, rewards
 from lfd.commands.options import Commands, Result
 from lfd.core.errors import InputError, LfdError
 from lfd.worlds.rendering import check_wish
@@ -48,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         kept = {
             "record": "finished episodes are kept",
+            "plan": "finished episodes are kept",
             "demo": "finished stages are kept",
             "train": "--resume goes on from the last checkpoint, if there was one",
             "sweep": "finished policies are kept",
@@ -107,7 +108,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = Commands(parser)
-    for group in (demonstrations, experts, learning, dagger, looking):
+    for group in (demonstrations, experts, learning, dagger, rewards, looking):
         group.add(commands)
     return parser
 

@@ -5,6 +5,7 @@ Meshes are logged once, without time; what moves are the transforms of their bod
 
 import os
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -14,6 +15,7 @@ import rerun.blueprint as rrb
 
 from lfd.core.errors import OutputError
 from lfd.core.rotations import xyzw_from_wxyz
+from lfd.planning.signed_distances import Box, Capsule, Floor, Shape
 from lfd.replay.clip import Clip
 
 VISUAL_GROUP = 1  # robosuite's group of the geoms that are meant to be seen
@@ -24,10 +26,12 @@ PATH_COLORS = {"ee": (60, 130, 246)}
 EYE = (1.05, -0.85, 1.45)
 """From where a clip is seen [m]: the robot's front and right."""
 OBJECT_COLOR = (234, 88, 12)
+SHAPE_COLOR = (110, 110, 110, 160)
+"""Of what a plan keeps clear of."""
 
 
-def replay(clip: Clip, *, save: Path | None, overwrite: bool = False) -> None:
-    """Write a clip to the file `save`, or open the viewer.
+def replay(clip: Clip, *, save: Path | None, overwrite: bool = False, shapes: Sequence[Shape] = ()) -> None:
+    """Write a clip, with shapes that its model does not have, to the file `save`, or open the viewer.
 
     Raises `OutputError` when the file exists or cannot be written, or when there is no screen.
     """
@@ -44,6 +48,7 @@ def replay(clip: Clip, *, save: Path | None, overwrite: bool = False) -> None:
     if clip.model is not None and clip.qpos is not None:
         log_shapes(recording, clip.model)
         _log_motion(recording, clip.model, clip.qpos, clip.times)
+    _log_scene(recording, shapes)
     _log_paths(recording, clip)
     _log_curves(recording, clip)
     _log_pictures(recording, clip)
@@ -189,6 +194,36 @@ def _log_motion(recording: rr.RecordingStream, model: mujoco.MjModel, qpos: np.n
                 translation=position[rows, body], quaternion=xyzw_from_wxyz(orientation[rows, body])
             ),
         )
+
+
+def _log_scene(recording: rr.RecordingStream, shapes: Sequence[Shape]) -> None:
+    """Log a scene's shapes without time, but for its floor: the model's table is there."""
+    solid = rr.components.FillMode.Solid
+    for number, shape in enumerate(shapes):
+        path = f"world/scene/{type(shape).__name__.lower()}_{number}"
+        match shape:
+            case Box(centre, half, yaw):
+                turn = rr.RotationAxisAngle(axis=(0, 0, 1), radians=yaw)
+                box = rr.Boxes3D(
+                    centers=[centre],
+                    half_sizes=[half],
+                    rotation_axis_angles=[turn],
+                    colors=[SHAPE_COLOR],
+                    fill_mode=solid,
+                )
+                recording.log(path, box, static=True)
+            case Capsule(start, end, radius):
+                assert start[:2] == end[:2], "people stand upright"
+                person = rr.Capsules3D(
+                    lengths=[end[2] - start[2]],
+                    radii=[radius],
+                    translations=[start],
+                    colors=[SHAPE_COLOR],
+                    fill_mode=solid,
+                )
+                recording.log(path, person, static=True)
+            case Floor():
+                pass
 
 
 def _log_paths(recording: rr.RecordingStream, clip: Clip) -> None:

@@ -64,7 +64,7 @@ def verify_episode(episode: Episode) -> Verification:
     about = episode.metadata
     if episode.sim_states is None or episode.start_memory is None:
         raise RecordingError("the episode has no simulation states; only recordings of lfd can be replayed exactly")
-    world = make_world(about.task, about.robot, about.control_hz, about.stepper)
+    world = make_world(about.task, about.robot, about.control_hz, about.stepper, controller=about.controller)
     start = WorldState(model_xml=episode.model_xml, sim=episode.sim_states[0], memory=episode.start_memory)
     states = _States()
     rollout(
