@@ -16,6 +16,7 @@ from lfd.loops.inverse_rl import L2, Learned, Problem, _covariance, _of_weights,
 from lfd.loops.plan_demonstrations import PlanRecipe, deviate, draw_scenes
 from lfd.loops.reward_judging import costs, regret, split
 from lfd.planning.arm_planner import MARGIN_M
+from lfd.replay.verify import verify_replay
 from lfd.rewards.reward_artifact import load_reward
 from tests.conftest import ROOT, call_json
 
@@ -169,6 +170,7 @@ def test_scenes_that_are_held_out_are_the_last(problem: Problem) -> None:
 @pytest.mark.slow
 def test_from_demonstrations_on_the_arm_to_plans_beside_them(recordings: Path, tmp_path: Path, capfd) -> None:
     dataset, reward, plans, picture = (tmp_path / n for n in ("dataset", "reward", "plans", "plan.rrd"))
+    assert verify_replay(recordings, 0).deviation == 0.0  # with the controller that it was recorded with
     from_recordings, planned = load_evidence(recordings), evidence(2)
     for seen, meant in zip(from_recordings.demonstrations, planned.demonstrations, strict=True):
         assert seen.placement == meant.placement
