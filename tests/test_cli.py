@@ -121,7 +121,7 @@ def test_any_key_of_a_recipe_can_be_set(thread, tmp_path) -> None:
     out = tmp_path / "policy"
     options = ["--set", "policy.hidden_sizes=[8]", "--set", "train.steps=2"]
     printed = call_json(["train", str(BC), "--dataset", str(thread.dataset), "--out", str(out), *options])
-    assert printed["parameters"] == (18 + 7) * 8 + 8 + 8 * 7 + 7
+    assert printed["parameters"] == (18 + 10) * 8 + 8 + 8 * 7 + 7
     assert json.loads((out / "manifest.json").read_text())["recipe"]["policy"]["hidden_sizes"] == [8]
 
 
