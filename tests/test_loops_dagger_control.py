@@ -6,7 +6,7 @@ import pytest
 from lfd.data.frames import load_frames
 from lfd.loops.dagger import dagger
 from lfd.loops.dagger_control import GATE_MAKERS, learner_of, visit
-from lfd.loops.dagger_recipe import GATES
+from lfd.loops.dagger_recipe import GATES, HUMAN
 from lfd.loops.dagger_round import counts_of, members, round_folder
 from lfd.record.episode_file import read_episode
 from lfd.run.gates import Ensemble, disagreement
@@ -14,7 +14,7 @@ from tests.test_loops_dagger import files, recipes
 
 
 def test_every_gate_of_a_recipe_can_be_made() -> None:
-    assert set(GATE_MAKERS) | {"none"} == set(GATES)
+    assert set(GATE_MAKERS) | {"none", HUMAN} == set(GATES)
 
 
 @pytest.mark.slow
