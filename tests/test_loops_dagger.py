@@ -320,6 +320,13 @@ def test_recipes_that_cannot_be_used(given, error, says) -> None:
         recipes(given)
 
 
+def test_keys_that_contradict_each_other_are_refused() -> None:
+    with pytest.raises(RecipeError, match="before the last round, which last_steps is for: leave out one"):
+        recipes("dagger.last_steps=10", "dagger.max_labels=100")
+    with pytest.raises(RecipeError, match=r"takes the coin's place: --set dagger\.beta=first"):
+        recipes("dagger.gate=human", "dagger.beta=linear")
+
+
 def test_labels_are_what_is_learned_from() -> None:
     with pytest.raises(RecipeError, match="learns from the expert's labels.*set convert.action=expert_action"):
         recipes(data=("convert.action=action",))

@@ -53,7 +53,7 @@ def best_response(
     Raises `SingularResponse` where the free Hessian is singular at the answer, `NoResponse` where R_H grows without end
     or the search does not converge, `InputError` for shapes that do not fit, NaN, or bounds that cross.
     """
-    u, u_robot = _vector("u_human_init", u_human_init), _vector("u_robot", u_robot)
+    u, u_robot = vector("u_human_init", u_human_init), vector("u_robot", u_robot)
     low, high = limits(bounds, u)
     u = torch.clamp(u, low, high)
     slope, curve, value = _derivatives(reward_human, u_robot)
@@ -103,7 +103,7 @@ def response_jacobian(
 
     Raises `SingularResponse` where the free Hessian is singular, `InputError` for shapes that do not fit or NaN.
     """
-    u_robot, u_human = _vector("u_robot", u_robot), _vector("u_human", u_human)
+    u_robot, u_human = vector("u_robot", u_robot), vector("u_human", u_human)
     free, curvature = free_curvature(reward_human, u_robot, u_human, bounds, ridge)
     mixed = jacrev(grad(reward_human, argnums=1), argnums=0)(u_robot, u_human)
     jacobian = torch.zeros(len(u_human), len(u_robot), dtype=torch.float64)
@@ -191,10 +191,11 @@ def _check_finite(g: Tensor, u: Tensor) -> None:
         raise InputError(f"reward_human has the slope {g.tolist()} at u_human = {u.tolist()}: it must be finite there")
 
 
-def _vector(name: str, values: Tensor) -> Float[Tensor, "k"]:
-    vector = torch.as_tensor(values, dtype=torch.float64).detach()
-    if vector.ndim != 1:
-        raise InputError(f"{name} has shape {tuple(vector.shape)}, expected one dimension")
-    if not torch.isfinite(vector).all():
-        raise InputError(f"{name} is {vector.tolist()}: every entry must be finite")
-    return vector
+def vector(name: str, values: Tensor) -> Float[Tensor, "k"]:
+    """Controls as they enter. Raises `InputError` for other shapes and entries that are not finite."""
+    given = torch.as_tensor(values, dtype=torch.float64).detach()
+    if given.ndim != 1:
+        raise InputError(f"{name} has shape {tuple(given.shape)}, expected one dimension")
+    if not torch.isfinite(given).all():
+        raise InputError(f"{name} is {given.tolist()}: every entry must be finite")
+    return given

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.func import grad, vjp
 
 from lfd.core.errors import InputError
-from lfd.interaction.responses import Bounds, Reward, _vector, best_response, free_curvature, limits
+from lfd.interaction.responses import Bounds, Reward, best_response, free_curvature, limits, vector
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ def leader_gradient(
 
     Raises what `response_jacobian` raises.
     """
-    u_robot, u_human = _vector("u_robot", u_robot), _vector("u_human", u_human)
+    u_robot, u_human = vector("u_robot", u_robot), vector("u_human", u_human)
     own, through = grad(reward_robot, argnums=(0, 1))(u_robot, u_human)
     if not (torch.isfinite(own).all() and torch.isfinite(through).all()):
         raise InputError(
@@ -81,9 +81,9 @@ def plan_stackelberg(
     `bounds` are the person's, `robot_bounds` the robot's. Each best response begins at the last one, the warm start of
     a receding horizon is the plan before, shifted. Raises what `best_response` and `leader_gradient` raise.
     """
-    start = _vector("u_robot_init", u_robot_init)
+    start = vector("u_robot_init", u_robot_init)
     low, high = limits(robot_bounds, start)
-    answer, solves = _vector("u_human_init", u_human_init), 0
+    answer, solves = vector("u_human_init", u_human_init), 0
 
     def loss(u: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal answer, solves

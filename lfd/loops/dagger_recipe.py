@@ -106,7 +106,11 @@ class DaggerRecipe:
         if self.gate == HUMAN and (self.labels_per_round or self.max_labels):
             raise RecipeError(f"{where} a person's episodes are not cut off: leave out labels_per_round and max_labels")
         if self.gate != "none" and self.beta != "first":
-            raise RecipeError(f'{where} gate = "{self.gate}" takes the coin\'s place: leave beta = "first"')
+            raise RecipeError(f'{where} gate = "{self.gate}" takes the coin\'s place: --set dagger.beta=first')
+        if self.last_steps and self.max_labels:
+            raise RecipeError(
+                f"{where} max_labels may end the loop before the last round, which last_steps is for: leave out one"
+            )
 
     @property
     def betas(self) -> tuple[float, ...]:
