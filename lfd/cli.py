@@ -8,7 +8,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from lfd.commands import dagger, demonstrations, experts, learning, looking, rewards
+from lfd.commands import (
+    comparisons,
+    corrections,
+    dagger,
+    demonstrations,
+    experts,
+    interaction,
+    learning,
+    looking,
+    reward,
+    rewards,
+)
 from lfd.commands.options import Commands, Result
 from lfd.core.errors import InputError, LfdError
 from lfd.worlds.rendering import check_wish
@@ -52,6 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "demo": "finished stages are kept",
             "train": "--resume goes on from the last checkpoint, if there was one",
             "sweep": "finished policies are kept",
+            "compare": "answers so far are kept, --resume goes on",
             "dagger": "finished rounds are kept, --resume goes on",
             "recover": "what was recovered so far is kept",
         }
@@ -108,7 +120,18 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = Commands(parser)
-    for group in (demonstrations, experts, learning, dagger, rewards, looking):
+    for group in (
+        demonstrations,
+        experts,
+        learning,
+        dagger,
+        rewards,
+        comparisons,
+        corrections,
+        reward,
+        interaction,
+        looking,
+    ):
         group.add(commands)
     return parser
 

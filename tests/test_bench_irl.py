@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from lfd.bench.irl import Ambiguity, IrlBench, Point, ambiguity_of, interval, plot, point_of, sections_of
+from lfd.bench.irl_arm import EXPERTS, ArmBench, ArmPoint, bench_arm
+from lfd.bench.irl_arm import rows_of as arm_rows
 from lfd.bench.irl_methods import METHODS, Learned, demonstrated_losses, evidence_of, learn, pairs
 from lfd.bench.irl_peer import Beside, each_log_likelihood, rows_of, run_program, visited_states
 from lfd.bench.irl_problems import (
@@ -21,6 +23,7 @@ from lfd.bench.irl_problems import (
     uniform_policy,
 )
 from lfd.bench.peers.process import PeerError, peers_folder
+from lfd.core.protocols import silent
 from lfd.planning import StatesAndActions, log_likelihood
 from lfd.reward_learning import maxent_tabular
 from tests.conftest import call_json
@@ -152,6 +155,18 @@ def test_the_page_and_the_picture(tmp_path) -> None:
         return Point(weights_evd=evd, policy_evd=evd / 2, gap=0.1, seconds=0.5, converged=evd < 0.5)
 
     at = [[point(0.5), point(0.7)], [point(0.1), point(0.3)]]
+
+    def on_arm(evd: float) -> ArmPoint:
+        return ArmPoint(evd=evd, gap=evd / 2, seconds=0.5)
+
+    few = [[on_arm(137.0), on_arm(0.2), on_arm(0.4)], [on_arm(0.01), on_arm(0.03), on_arm(0.02)]]
+    arm = ArmBench(
+        counts=(1, 10),
+        held_out=4,
+        seeds=(0, 1, 2),
+        points={expert: dict.fromkeys(("apprenticeship", "margin", "maxent"), few) for expert in (SOFT, OPTIMAL)},
+        experts={SOFT: [0.07, 0.08, 0.06], OPTIMAL: [0.0, 0.0, 0.0]},
+    )
     measured = IrlBench(
         size=8,
         counts=(4, 64),
@@ -165,10 +180,11 @@ def test_the_page_and_the_picture(tmp_path) -> None:
             ]
             for name in PROBLEMS
         },
+        arm=arm,
         beside=(),
         missing="no network",
     )
-    grid, objects, told, beside = sections_of(measured).values()
+    grid, objects, cup, told, beside = sections_of(measured).values()
     assert grid == objects
     low, high = 0.2 - 12.7062 * 0.1, 0.2 + 12.7062 * 0.1  # t of one degree of freedom
     said = f"0.200 [{low:.3f}, {high:.3f}]"
@@ -178,9 +194,28 @@ def test_the_page_and_the_picture(tmp_path) -> None:
     assert told["grid-world: features"] == "9"
     assert told["grid-world: told to within 1 nat by 64 demonstrations of the maximum entropy policy"] == "5 to 7"
     assert told["objectworld: largest change of an action's probability, w moved by 10 along the others"] == "1.0e-14"
+    assert cup["scenes"] == "3 x 4 held out; medians over seeds, (smallest to largest)"
+    assert cup["EVD of the soft expert itself"] == "0.07 (0.06 to 0.08)"
+    assert cup["EVD of the weights, soft expert, 1 demonstration"].startswith("apprenticeship 0.4 (0.2 to 137); margin")
+    assert cup["feature gap, optimal expert, 10 demonstrations"].endswith("; maxent 0.01 (0.005 to 0.015)")
     assert beside == {"imitation": "left out: no network"}
     plot(measured, tmp_path / "inverse_rl.png")
     assert (tmp_path / "inverse_rl.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_an_arm_s_demonstrators_pay_what_they_should_and_every_method_is_judged() -> None:
+    with silent("", 1) as bar:
+        found = bench_arm(counts=(1,), held_out=1, seeds=(3,), bar=bar)
+    assert found.experts[OPTIMAL] == [0.0]
+    assert 0.02 < found.experts[SOFT][0] < 0.2
+    assert set(found.points) == set(EXPERTS) == {SOFT, OPTIMAL}
+    for methods in found.points.values():
+        for ((point,),) in methods.values():
+            assert point.evd > -0.05  # below 0 by what plans pay for coming near to things, which is no cost here
+            assert point.gap >= 0
+            assert point.seconds > 0
+    assert len(arm_rows(found)) == 9
 
 
 @pytest.mark.slow
@@ -188,6 +223,7 @@ def test_the_command_is_quick() -> None:
     found = call_json(["bench", "irl", "--quick"])
     assert found["missing"] == "not asked for"
     assert set(found["points"]) == set(PROBLEMS)
+    assert set(found["arm"]["points"]) == {SOFT, OPTIMAL}
     for world in found["ambiguity"]["grid-world"]:
         assert (world["features"], world["identified"]) == (64, 63)
 

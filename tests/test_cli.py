@@ -15,7 +15,7 @@ from tests.conftest import BC, LIFT, ROOT, call_json
 
 COMMANDS = (
     "record", "convert", "verify", "export", "trace", "recover", "train", "eval", "sweep", "replay", "info", "doctor",
-    "bench", "demo", "plan", "features", "irl",
+    "bench", "demo", "plan", "features", "irl", "compare", "correct", "reward", "interact",
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-PAGES = ("inverse_rl", "comparisons", "interaction")
+PAGES = ("inverse_rl", "comparisons", "reward_belief", "interaction")
 
 
 @pytest.mark.parametrize("name", PAGES)

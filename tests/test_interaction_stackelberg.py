@@ -130,3 +130,29 @@ def test_what_has_no_answer_is_said() -> None:
         best_response(quadratic, U[None], ZERO)
     with pytest.raises(InputError, match="u_human_init is"):
         best_response(quadratic, U, ZERO * torch.nan)
+
+
+def test_a_control_that_ends_beside_its_bound_by_rounding_is_held_there() -> None:
+    def person(u_robot, u_human):
+        return u_human[0] * 3.0 - (u_human[1] - 0.2) ** 2 - 0.1 * (u_human**4).sum()
+
+    beside = torch.tensor([1.0 - 4e-16, 0.9], dtype=torch.float64)
+    u = best_response(person, U, beside, bounds=(-1.0, 1.0))
+    assert u[0] == pytest.approx(1.0)
+    jacobian = response_jacobian(lambda a, b: person(a, b) + a.sum() * b.sum(), U, u, bounds=(-1.0, 1.0))
+    assert (jacobian[0] == 0.0).all()
+
+
+def test_people_one_after_the_other_answer_as_each_of_them_alone() -> None:
+    def two(u_robot, u_human):
+        return quadratic(u_robot, u_human[:2]) + curved(u_robot, u_human[2:])
+
+    together = best_response(two, U, torch.zeros(4, dtype=torch.float64), bounds=(-0.1, 0.9), followers=2)
+    alone = [best_response(reward, U, ZERO, bounds=(-0.1, 0.9)) for reward in (quadratic, curved)]
+    torch.testing.assert_close(together, torch.cat(alone), atol=1e-9, rtol=0.0)
+
+    def leader(u_robot, u_human):
+        return robot(u_robot, u_human[:2]) + (u_human[2:] * u_robot[:2]).sum()
+
+    blocks, whole = (leader_gradient(leader, two, U, together, bounds=(-0.1, 0.9), followers=n) for n in (2, 1))
+    torch.testing.assert_close(blocks, whole, atol=1e-12, rtol=0.0)

@@ -13,7 +13,7 @@ from lfd.core.recipe import build, load_toml
 from lfd.loops.arm_evidence import Demonstration, Evidence, load_evidence, resampled
 from lfd.loops.cup_scenes import Placement
 from lfd.loops.inverse_rl import L2, Learned, Problem, _covariance, _of_weights, identifiable, learn, scene_softmax
-from lfd.loops.plan_demonstrations import PlanRecipe, deviate, draw_scenes
+from lfd.loops.plan_demonstrations import PlanRecipe, demonstrations_in, deviate, draw_scenes
 from lfd.loops.reward_judging import costs, regret, split
 from lfd.planning.arm_planner import MARGIN_M
 from lfd.replay.verify import verify_replay
@@ -75,6 +75,22 @@ def test_deviations_have_the_size_that_was_asked_for_and_leave_the_ends(rng: np.
     np.testing.assert_array_equal(made[:, [0, -1]], 0.0)
     assert made[:, 10, :6].std() == pytest.approx(0.02, rel=0.1)
     assert deviate(planner, one.trajectory, 0.0, rng) is one.trajectory
+
+
+@pytest.mark.slow
+def test_a_demonstrator_who_is_rational_only_so_far_pays_more_than_the_plan_by_what_theory_says() -> None:
+    best, soft = recipe(1, seed=5, per_scene=2), recipe(1, seed=5, per_scene=4, rationality=200.0)
+    (placement,) = draw_scenes(best)
+    plan, repeated = demonstrations_in(best, 0, placement)
+    assert all(way is plan.trajectory for way in repeated)
+    same, drawn = demonstrations_in(soft, 0, placement)
+    np.testing.assert_array_equal(same.trajectory, plan.trajectory)
+    planner = soft.planner(evidence(2).arm, placement)
+    paid = costs(planner, soft.weights, soft.smoothness, np.array(drawn)) - plan.cost
+    freedoms = 18 * 7  # of 20 waypoints without both ends; in a quadratic cost each of them costs 1 / (2 beta)
+    assert paid.mean() == pytest.approx(freedoms / (2 * 200.0), rel=0.25)
+    assert len({float(way[9, 0]) for way in drawn}) == 4
+    np.testing.assert_array_equal(demonstrations_in(soft, 0, placement)[1], drawn)
 
 
 def test_resampling_hits_what_was_seen() -> None:
@@ -212,13 +228,29 @@ def test_bad_input_is_a_sentence(lfd_fails, thread, tmp_path: Path) -> None:
     def irl(*more: str | Path) -> str:
         return lfd_fails("irl", "maxent", "--out", out, *more)
 
-    assert "keeps no scene to plan in; `lfd plan datasets/cup_panda.toml" in irl("--dataset", thread.recordings)
-    assert "keeps no scene to plan in" in lfd_fails("features", thread.dataset)
+    neither, make = (
+        "is neither recordings of plans nor a dataset of them: ",
+        "`lfd plan datasets/cup_panda.toml --out DIR`",
+    )
+    for source in (thread.recordings, thread.dataset):
+        said = lfd_fails("features", source)
+        assert f"{source} {neither}" in said
+        assert f"keeps no scene to plan in; {make}" in said
+    (one, *_) = sorted(thread.recordings.glob("*.mcap"))
+    assert f"{one} keeps no scene to plan in; {make}" in irl("--dataset", one)
+    said = lfd_fails("features", thread.policy)
+    assert f"{thread.policy} {neither}it holds no .mcap file and no meta/info.json; {make}" in said
+    (foreign := tmp_path / "foreign").mkdir()
+    (foreign / "garbage.mcap").write_bytes(b"no recording of anything")
+    assert f"{foreign} is not all recordings of plans: {foreign / 'garbage.mcap'}" in lfd_fails("features", foreign)
     assert "no recording" in irl("--dataset", tmp_path / "none")
     assert "holds no reward.json" in lfd_fails("plan", thread.recordings, "--out", out)
     assert "no recipe" in lfd_fails("plan", tmp_path / "none.toml", "--out", out)
     plan = ("plan", CUP, "--out", out)
     assert "has 1 weights for 5 features: one for each" in lfd_fails(*plan, "--set", "plan.weights=[1.0]")
+    both = lfd_fails(*plan, "--set", "plan.rationality=100.0", "--noise", "0.1")
+    assert "two ways to deviate from the optimum; set one of them to 0" in both
+    assert "rationality = -1.0: must not be negative, and finite" in lfd_fails(*plan, "--set", "plan.rationality=-1.0")
     assert "unknown robot" in lfd_fails(*plan, "--robot", "pnda")
     assert "let it take" in lfd_fails(*plan, "--set", "plan.duration_s=5")
     assert "there will be plans 0 to 9" in lfd_fails(*plan, "--episode", "10", "--save", tmp_path / "x.rrd")

@@ -3,9 +3,10 @@ import pytest
 from scipy import stats
 
 from lfd.core.errors import InputError, UnknownName
-from lfd.reward_learning.choices import Choice, log_likelihood
+from lfd.reward_learning.choices import log_likelihood
 from lfd.reward_learning.preference_posterior import PreferencePosterior
 from lfd.reward_learning.slice_sampling import elliptical_steps
+from lfd.rewards.factors import Choice
 
 ANSWERS: list[tuple[np.ndarray, np.ndarray, Choice]] = [
     (np.array([1.0, 0.2]), np.array([0.1, 0.4]), "a"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lfd.core.errors import InputError, UnknownName
-from lfd.reward_learning.queries import best_batch, best_query, query_values, worth_asking
+from lfd.reward_learning.queries import best_batch, best_query, joint_batch, query_values, worth_asking
 
 RATIONALITY = 3.0
 
@@ -107,3 +107,26 @@ def test_what_cannot_be_asked_is_said(drawn) -> None:
         query_values(differences, samples, criterion="entropy", rationality=1.0)  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="samples is empty"):
         query_values(differences, samples[:0], rationality=1.0)
+
+
+def test_a_batch_of_given_differences_asks_nothing_twice_and_is_that_of_all_pairs(rng, drawn) -> None:
+    _, samples = drawn
+    features = rng.normal(size=(4, 3))
+    pairs = np.array([(i, j) for i in range(4) for j in range(i + 1, 4)])
+    chosen = joint_batch(features[pairs[:, 0]] - features[pairs[:, 1]], samples, 8, rationality=RATIONALITY)
+    assert sorted(q for q, _ in chosen) == list(range(6))
+    batch = best_batch(features, samples, 6, rationality=RATIONALITY)
+    assert [(i, j) for i, j, _ in batch] == [tuple(pairs[q]) for q, _ in chosen]
+    np.testing.assert_allclose([q.value for q in batch], [bits for _, bits in chosen])
+    with pytest.raises(InputError, match="all trajectories have the same features"):
+        best_batch(np.ones((3, 3)), samples, 2, rationality=RATIONALITY)
+
+
+def test_the_gains_of_a_batch_stay_numbers_where_answers_are_certain(rng) -> None:
+    """Chances of 1 under every sample: p(b) is 0 but for rounding, which may have either sign."""
+    for count in range(20, 60):
+        samples = np.column_stack([rng.normal(size=count), np.ones(count)])
+        differences = np.array([[1.0, 0.0], [0.5, 0.1], [0.0, 1e6], [0.0, 2e6]])
+        gains = np.array([bits for _, bits in joint_batch(differences, samples, 4, rationality=1.0)])
+        assert np.isfinite(gains).all()
+        assert (gains > -1e-12).all()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lfd.core.errors import InputError, OutputError, UnknownName
+from lfd.rewards.factors import GaussianFactor, PushFactor
 from lfd.rewards.reward_artifact import LinearReward, load_reward, save_reward
 
 REWARD = LinearReward(
@@ -27,13 +28,19 @@ def save(reward: LinearReward, out: Path) -> None:
 
 
 def test_a_reward_comes_back_as_it_was_saved(tmp_path: Path) -> None:
-    changed = REWARD.changed(np.array([-2.0, 1 / 3]), "a comparison", covariance=None)
+    push = PushFactor(np.array([0.1, 1 / 3]))
+    changed = REWARD.changed(np.array([-2.0, 1 / 3]), "a push", push, covariance=None)
     for reward in (REWARD, changed):
         out = tmp_path / str(len(reward.history))
         save(reward, out)
         found = load_reward(out)
-        for name in ("features", "robot", "waypoints", "duration_s", "smoothness", "method", "measures", "history"):
+        for name in ("features", "robot", "waypoints", "duration_s", "smoothness", "method", "measures"):
             assert getattr(found, name) == getattr(reward, name)
+        for ours, theirs in zip(reward.history, found.history, strict=True):
+            assert (theirs.evidence, theirs.before, theirs.after) == (ours.evidence, ours.before, ours.after)
+            assert type(theirs.factor) is type(ours.factor)
+            for name, value in vars(ours.factor).items():
+                np.testing.assert_array_equal(getattr(theirs.factor, name), value)
         np.testing.assert_array_equal(found.weights, reward.weights)
         np.testing.assert_array_equal(found.ranges, reward.ranges)
         assert (found.covariance is None) == (reward.covariance is None)
@@ -43,12 +50,36 @@ def test_a_reward_comes_back_as_it_was_saved(tmp_path: Path) -> None:
 
 
 def test_history_has_the_weights_before_and_after() -> None:
-    twice = REWARD.changed(np.array([-2.0, 0.0]), "one").changed(np.array([-3.0, 1.0]), "two")
+    once = REWARD.changed(np.array([-2.0, 0.0]), "one", None, covariance=None)
+    twice = once.changed(np.array([-3.0, 1.0]), "two", None, covariance=np.eye(2))
     assert [(c.evidence, c.before, c.after) for c in twice.history] == [
+        ("weights as they were (maxent)", (), (-1.0, -0.1)),
         ("one", (-1.0, -0.1), (-2.0, 0.0)),
         ("two", (-2.0, 0.0), (-3.0, 1.0)),
     ]
     assert REWARD.history == ()
+    assert REWARD.covariance is not None
+    begun = twice.history[0].factor
+    assert isinstance(begun, GaussianFactor)
+    np.testing.assert_allclose(begun.precision, np.linalg.inv(REWARD.covariance))
+    assert twice.undone().history == once.history
+    np.testing.assert_array_equal(twice.undone().weights, once.weights)
+    with pytest.raises(InputError, match="nothing to undo: the history has only what the reward began with"):
+        once.undone().undone()
+
+
+def test_histories_of_before_are_refused_and_so_are_other_orders_of_features(tmp_path: Path) -> None:
+    save(REWARD.changed(REWARD.weights, "a push", PushFactor(np.ones(2)), covariance=None), tmp_path / "reward")
+    file = tmp_path / "reward" / "reward.json"
+    good = json.loads(file.read_text())
+    old = [{k: v for k, v in entry.items() if k != "factor"} for entry in good["history"]]
+    file.write_text(json.dumps(good | {"history": old}))
+    with pytest.raises(InputError, match="was written before histories kept the evidence itself.*learn it again"):
+        load_reward(tmp_path / "reward")
+    good["history"][1]["factor"]["features"].reverse()
+    file.write_text(json.dumps(good))
+    with pytest.raises(InputError, match="'a push' has the features cup_tilt, person_closeness, the reward has"):
+        load_reward(tmp_path / "reward")
 
 
 def test_units_are_those_of_counts() -> None:

@@ -1,14 +1,14 @@
-"""`lfd bench irl`: three methods of inverse RL on grids, against the number of demonstrations; and what cannot be told.
+"""`lfd bench irl`: three methods of inverse RL against the number of demonstrations; and what cannot be told.
 
-For each problem, expert and number of demonstrations, over several seeds (each with a world, reward and demonstrations
-of its own):
+On grids, for each problem, expert and number of demonstrations, over several seeds (each with a world, reward and
+demonstrations of its own):
 
 - **EVD**, expected value difference: what the optimal policy of the learned weights falls short of under the true
   reward, (V* - V) / (V* - V_uniform); and the same for the policies that the method hands over;
 - **feature gap** |mu_E - mu(pi)| / |mu_E - mu(uniform)|, with the expert's exact mu_E and what is handed over as pi;
 - CPU time.
 
-`lfd.bench.irl_peer` compares with imitation.
+`lfd.bench.irl_arm` measures them on an arm, `lfd.bench.irl_peer` compares with imitation.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import t as student
 
-from lfd.bench import irl_peer
+from lfd.bench import irl_arm, irl_peer
 from lfd.bench.irl_methods import APPRENTICESHIP, ENTROPY, METHODS, PRIOR, Learned, evidence_of, learn
 from lfd.bench.irl_problems import PROBLEMS, SOFT, Problem, make_problem, uniform_policy
 from lfd.bench.peers.process import PeerError, peer_python, peers_folder
@@ -77,6 +77,8 @@ class IrlBench:
     """Problem to expert to its own EVD in every seed."""
     ambiguity: dict[str, list[Ambiguity]]
     """Problem to what can be told in every seed's world."""
+    arm: irl_arm.ArmBench
+    """The same on an arm."""
     beside: tuple[irl_peer.Beside, ...]
     """Grids on which imitation was compared with."""
     missing: str
@@ -84,13 +86,23 @@ class IrlBench:
 
 
 def bench_irl(
-    *, size: int, counts: Sequence[int], seeds: Sequence[int], grids: int, peer_size: int, progress: Progress = silent
+    *,
+    size: int,
+    counts: Sequence[int],
+    seeds: Sequence[int],
+    arm: tuple[Sequence[int], int, Sequence[int]],
+    grids: int,
+    peer_size: int,
+    progress: Progress = silent,
 ) -> IrlBench:
-    """Measure the methods on grids of `size` x `size` cells, and imitation on `grids` of `peer_size` (0: on none)."""
+    """Measure the methods on grids of `size` x `size` cells, and imitation on `grids` of `peer_size` (0: on none).
+
+    `arm` are the numbers of demonstrations, the number of scenes held out and the seeds of `bench_arm`.
+    """
     points: dict[str, Any] = {name: {} for name in PROBLEMS}
     experts: dict[str, Any] = {name: {} for name in PROBLEMS}
     ambiguity: dict[str, list[Ambiguity]] = {name: [] for name in PROBLEMS}
-    with progress("bench irl", len(PROBLEMS) * len(seeds) + grids) as bar:
+    with progress("bench irl", len(PROBLEMS) * len(seeds) + len(arm[2]) + grids) as bar:
         for number, name in enumerate(PROBLEMS):
             for seed in seeds:
                 rng = np.random.default_rng((seed, number))
@@ -98,6 +110,7 @@ def bench_irl(
                 last = _one_world(problem, counts, rng, points[name], experts[name])
                 ambiguity[name].append(ambiguity_of(problem.mdp, last.weights, demonstrations=counts[-1]))
                 bar.advance(note=f"{name}, seed {seed}")
+        on_arm = irl_arm.bench_arm(counts=arm[0], held_out=arm[1], seeds=arm[2], bar=bar)
         beside, missing = _beside(grids, peer_size, seeds[0], bar)
     return IrlBench(
         size=size,
@@ -106,6 +119,7 @@ def bench_irl(
         points=points,
         experts=experts,
         ambiguity=ambiguity,
+        arm=on_arm,
         beside=beside,
         missing=missing,
     )
@@ -200,6 +214,7 @@ def sections_of(measured: IrlBench) -> dict[str, dict[str, str]]:
     beside = irl_peer.rows_of(measured.beside) if measured.beside else {"imitation": f"left out: {measured.missing}"}
     return (
         sections
+        | {"Inverse RL: cup scenes, Panda": irl_arm.rows_of(measured.arm)}
         | {"Inverse RL: what is identifiable": _ambiguity_rows(measured)}
         | {"Inverse RL: maximum entropy beside imitation's MCEIRL": beside}
     )
@@ -260,21 +275,26 @@ def plot(measured: IrlBench, path: Path) -> None:
     from matplotlib.figure import Figure
 
     columns = [(name, expert) for name in measured.points for expert in measured.points[name]]
-    figure = Figure(figsize=(3.3 * len(columns), 6.0), layout="constrained")
-    grid = figure.subplots(2, len(columns), sharex=True, sharey="row", squeeze=False)
-    for axes, (name, expert) in zip(grid.T, columns, strict=True):
+    figure = Figure(figsize=(3.3 * (len(columns) + len(measured.arm.points)), 6.0), layout="constrained")
+    grid = figure.subplots(2, len(columns) + len(measured.arm.points), squeeze=False)
+    for axes, (name, expert) in zip(grid.T, columns, strict=False):
         for method, at in measured.points[name][expert].items():
             _curve(axes[0], measured.counts, at, "weights_evd", COLOURS[method], "o-", method)
             _curve(axes[1], measured.counts, at, "gap", COLOURS[method], "o-", method)
         mixture = measured.points[name][expert][APPRENTICESHIP]
         _curve(axes[0], measured.counts, mixture, "policy_evd", COLOURS[APPRENTICESHIP], "o--", "its mixture")
         axes[0].axhline(float(np.mean(measured.experts[name][expert])), color="0.5", linestyle=":", label="the expert")
-        axes[0].set(title=f"{name}, {expert}", xscale="log")
-        axes[1].set(xlabel="demonstrations")
-        for each in axes:
-            each.grid(alpha=0.3)
-    grid[0, 0].set(ylabel="EVD (1: random actions)", ylim=(-0.02, 1.02))
-    grid[1, 0].set(ylabel="feature gap (1: random actions)", ylim=(0, None))
+        axes[0].set(title=f"{name}, {expert}", xscale="log", ylim=(-0.02, 1.02))
+        axes[1].set(xlabel="demonstrations", xscale="log")
+    highest = max(axes.get_ylim()[1] for axes in grid[1, : len(columns)])
+    for axes in grid[1, : len(columns)]:
+        axes.set_ylim(0, highest)
+    for axes, expert in zip(grid.T[len(columns) :], measured.arm.points, strict=True):
+        irl_arm.draw(measured.arm, expert, axes[0], axes[1], list(COLOURS.values()))
+    for each in grid.flat:
+        each.grid(alpha=0.3)
+    grid[0, 0].set(ylabel="EVD (1: random actions)")
+    grid[1, 0].set(ylabel="feature gap (1: random actions)")
     grid[0, 0].legend(frameon=False, fontsize="small")
     figure.savefig(path, dpi=110)
 

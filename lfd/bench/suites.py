@@ -3,6 +3,7 @@
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 from lfd.terminal import progress_bar
@@ -131,8 +132,6 @@ def _train(given: Namespace) -> tuple[Measured, Measured]:
 
 
 def _compounding(given: Namespace) -> tuple[Measured, Measured]:
-    from pathlib import Path
-
     from lfd.bench.compounding import bench_compounding, plot, rows_of
     from lfd.bench.stretched_lift import Setting
 
@@ -158,8 +157,6 @@ def _compounding(given: Namespace) -> tuple[Measured, Measured]:
 
 
 def _dagger(given: Namespace) -> tuple[Measured, Measured]:
-    from pathlib import Path
-
     from lfd.bench.dagger import bench_dagger, plot, rows_of, setting_of
 
     seeds = (given.seed,) if given.quick else tuple(range(given.seed, given.seed + 5))
@@ -170,8 +167,6 @@ def _dagger(given: Namespace) -> tuple[Measured, Measured]:
 
 
 def _comparisons(given: Namespace) -> tuple[Measured, Measured]:
-    from pathlib import Path
-
     from lfd.bench.comparisons import bench_comparisons, plot, rows_of
 
     measured = bench_comparisons(
@@ -191,8 +186,6 @@ def _comparisons(given: Namespace) -> tuple[Measured, Measured]:
 
 
 def _irl(given: Namespace) -> tuple[Measured, Measured]:
-    from pathlib import Path
-
     from lfd.bench.irl import bench_irl, plot, sections_of
 
     measured = bench_irl(
@@ -201,11 +194,44 @@ def _irl(given: Namespace) -> tuple[Measured, Measured]:
         seeds=range(given.seed, given.seed + (2 if given.quick else 10)),
         grids=0 if given.quick else 3,
         peer_size=30,
+        arm=((1,), 1, range(given.seed, given.seed + 1))
+        if given.quick
+        else ((1, 3, 6), 3, range(given.seed, given.seed + 3)),
         progress=progress_bar,
     )
     if given.results is not None:
         plot(measured, Path("docs/pictures/inverse_rl.png"))
     return asdict(measured), sections_of(measured)
+
+
+def _corrections(given: Namespace) -> tuple[Measured, Measured]:
+    from lfd.bench.corrections import ROBOTS, bench_corrections, plot, sections_of
+
+    measured = bench_corrections(
+        robots=ROBOTS[:1] if given.quick else ROBOTS,
+        people=1 if given.quick else 20,
+        quiet_runs=2 if given.quick else 34,
+        seed=given.seed,
+        progress=progress_bar,
+    )
+    if given.results is not None:
+        plot(measured, Path("docs/pictures/corrections.png"))
+    return asdict(measured), sections_of(measured)
+
+
+def _interaction(given: Namespace) -> tuple[Measured, Measured]:
+    from lfd.bench.interaction import as_dict, bench_interaction, plot, sections_of
+
+    measured = bench_interaction(
+        scenes=("merge",) if given.quick else ("merge", "crossing"),
+        episodes=10 if given.quick else 200,
+        seed=given.seed,
+        compared_steps=10 if given.quick else 30,
+        progress=progress_bar,
+    )
+    if given.results is not None:
+        plot(measured, Path("docs/pictures"))
+    return as_dict(measured), sections_of(measured)
 
 
 SUITES: dict[str, Suite] = {
@@ -218,5 +244,7 @@ SUITES: dict[str, Suite] = {
     "dagger": _dagger,
     "irl": _irl,
     "comparisons": _comparisons,
+    "corrections": _corrections,
+    "interaction": _interaction,
 }
 """Name to suite."""

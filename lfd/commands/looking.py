@@ -85,7 +85,19 @@ def run_doctor(given: Namespace) -> Result:
     return {**marks, "failed": any(c.needed and not c.works for c in checks)}
 
 
-SUITES = ("sim", "cameras", "record", "convert", "train", "compounding", "dagger", "comparisons", "irl")
+SUITES = (
+    "sim",
+    "cameras",
+    "record",
+    "convert",
+    "train",
+    "compounding",
+    "dagger",
+    "comparisons",
+    "irl",
+    "corrections",
+    "interaction",
+)
 """Names of `lfd.bench.suites`, which is imported when one runs."""
 
 
@@ -96,7 +108,9 @@ def _bench(commands: Commands) -> None:
         "measure side by side: sim (robosuite's step, ours, the physics alone), cameras (robosuite's, ours), record "
         "(with and without, writers, real time), convert (LeRobot's calls, ours), train (loading and gradient steps: "
         "LeRobot, robomimic, imitation, ours), compounding (errors against the horizon), dagger (success by labels), "
-        "comparisons (alignment by answers), irl (three methods by demonstrations, imitation)",
+        "comparisons (alignment by answers), irl (three methods by demonstrations, imitation), "
+        "corrections (what pushes teach, how soon they are noticed), interaction (four robots among people, planning "
+        "with either gradient)",
         "lfd bench sim --quick",
     )
     made.add_argument("suite", choices=SUITES, help="what to measure")
@@ -124,7 +138,9 @@ def run_bench(given: Namespace) -> Result:
         command = f"lfd bench {given.suite}" + " --quick" * given.quick + " --full" * given.full
         for title, rows in sections.items():
             write_section(given.results, title, command, rows)
-    return measured
+    if given.json:
+        return measured
+    return {f"{title}: {name}": value for title, rows in sections.items() for name, value in rows.items()}
 
 
 def _demo(commands: Commands) -> None:

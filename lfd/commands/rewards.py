@@ -96,13 +96,12 @@ def _of_recipe(given: Namespace) -> tuple[Any, list[Any], dict[str, Any], None]:
 
 def _of_reward(given: Namespace) -> tuple[Any, list[Any], dict[str, Any], Any]:
     """Recipe, scenes, tables and demonstrations of a learned reward."""
-    from lfd.loops.arm_evidence import load_evidence
     from lfd.loops.plan_demonstrations import PlanRecipe
-    from lfd.loops.plans_beside import demonstrations_of
+    from lfd.loops.plans_beside import shown_for
     from lfd.rewards.reward_artifact import load_reward
 
     reward = load_reward(given.reward)
-    shown = load_evidence(given.beside or demonstrations_of(given.reward))
+    shown = shown_for(given.reward, given.beside)
     if given.set:
         raise InputError("--set is for recipes; a learned reward has no keys to override")
     robot = given.robot or reward.robot
@@ -179,23 +178,34 @@ def _irl(commands: Commands) -> None:
         "judge the learned reward's plans there",
     )  # fmt: skip
     made.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the candidates (default: 0)")
+    made.add_argument(
+        "--reward", type=Path, metavar="OLD",
+        help="a reward to which the demonstrations are added as further evidence, whatever it was learned from; "
+        "maxent only",
+    )  # fmt: skip
     output(made, "the reward")
 
 
 def run_irl(given: Namespace) -> Result:
     """A reward from demonstrations."""
-    from lfd.core.artifact import check_output
+    from lfd.core.artifact import check_output, sha256
     from lfd.loops.arm_evidence import load_evidence
-    from lfd.loops.inverse_rl import Problem, convergence_picture, identifiable, learn
+    from lfd.loops.inverse_rl import Problem, convergence_picture, identifiable, joined, learn
     from lfd.loops.reward_judging import regret, split
-    from lfd.rewards.reward_artifact import save_reward
+    from lfd.rewards.reward_artifact import load_reward, save_reward
     from lfd.terminal import progress_bar
 
     check_output(given.out, overwrite=given.overwrite)
+    if given.reward and given.method != "maxent":
+        raise InputError(f"--reward joins evidence by its likelihood, which {given.method} has not; use lfd irl maxent")
+    old = load_reward(given.reward) if given.reward else None
     evidence, held_out = split(load_evidence(given.dataset), given.holdout)
-    features = given.features or evidence.recipe.features
+    features = given.features or (evidence.recipe.features if old is None else old.features)
     problem = Problem(evidence, features, seed=given.seed, progress=progress_bar)
     reward, found = learn(problem, given.method, evidence)
+    parents = dict(evidence.parents)
+    if old is not None:
+        reward, parents = joined(old, reward), parents | {str(given.reward): sha256(given.reward)}
     told = identifiable(problem)
     rows = {
         name: {"weight": float(w), "unit": f"1/({unit})", "per_range": float(w * spread), "identifiable": known}
@@ -210,7 +220,7 @@ def run_irl(given: Namespace) -> Result:
         reward,
         given.out,
         recipe={"method": given.method, "features": list(features), "holdout": given.holdout},
-        parents=evidence.parents,
+        parents=parents,
         seed=given.seed,
         overwrite=given.overwrite,
         also={

@@ -86,6 +86,8 @@ CHANNELS: dict[str, Channel] = {row.name: row for row in (
     _row("{object}_point", "position of a point of an object, or of the nearest and the mean dirt that is left", "m", "world", "/objects/{object}/point", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/point"),
     _row("{object}_pos", "position of an object's body", "m", "world", "/objects/{object}/pose", POSE, "position", ENVIRONMENT_STATE, "plots/objects/{object}/position"),
     _row("{object}_quat", "orientation of an object's body, wxyz", "1", "world", "/objects/{object}/pose", POSE, "orientation", ENVIRONMENT_STATE, "plots/objects/{object}/orientation"),
+    _row("{object}_speed", "speed of an object along its heading", "m/s", "object", "/objects/{object}/speed", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/speed"),
+    _row("{object}_distance", "distance between the surfaces of an object and of the robot", "m", "world", "/objects/{object}/distance", ARRAY, "data", ENVIRONMENT_STATE, "plots/objects/{object}/distance"),
     _row("{camera}_picture", "what a camera sees, RGB", "1/255", "camera", "/cameras/{camera}", IMAGE, "data", "observation.images.{camera}", "cameras/{camera}"),
     _row("sim_state", "MuJoCo's mjSTATE_INTEGRATION", "mixed", "model", "/sim/state", ARRAY, "data", None, ""),
     _row("action", "action that was applied", "controller", "controller", "/action", ARRAY, "data", "action", "plots/action/applied"),
@@ -93,6 +95,12 @@ CHANNELS: dict[str, Channel] = {row.name: row for row in (
     _row("policy_action", "action that the learner proposed", "controller", "controller", "/policy/action", ARRAY, "data", None, "plots/action/policy"),
     _row("gate", "what a gate measured when it decided who acts", "mixed", "task", "/gate", ARRAY, "data", None, "plots/gate"),
     _row("teleop_axes", "what a person's device said, before gains", "1", "device", "/teleop/axes", ARRAY, "data", None, "plots/teleop/axes"),
+    _row("belief", "probability of each intent that a person may have", "1", "task", "/belief", ARRAY, "data", None, "plots/belief"),
+    _row("belief_entropy", "entropy of the belief about a person's intent", "nat", "task", "/belief/entropy", ARRAY, "data", None, "plots/belief_entropy"),
+    _row("push", "force and torque of a person on the arm, at the pushed body's centre", "N and N m", "world", "/push", ARRAY, "data", None, "plots/push"),
+    _row("external_torque", "what the arm takes for the torque of a push", "N m", "joint", "/external_torque", ARRAY, "data", None, "plots/external_torque"),
+    _row("weights", "reward for each unit of a feature's count", "mixed", "task", "/reward/weights", ARRAY, "data", None, "plots/weights"),
+    _row("{plan}_path", "the gripper's way by a plan: planned, deformed by a push, new", "m", "world", "/plans/{plan}", ARRAY, "data", None, "world/plans/{plan}"),
     _row("pace", "how late the step began, in a recording in real time", "s", "clock", "/pace", ARRAY, "data", None, "plots/pace"),
     _row("reward", "reward of the step", "1", "task", "/step", ARRAY, "reward", "next.reward", "plots/step/reward"),
     _row("success", "success after the step", "bool", "task", "/step", ARRAY, "success", "next.success", "plots/step/success"),
@@ -126,6 +134,19 @@ def channel(name: str) -> Channel:
         if suffix and blank.startswith("{") and name.endswith(suffix) and len(name) > len(suffix):
             return row.of(name)
     raise UnknownName("channel", name, CHANNELS)
+
+
+def signal_of(topic: str) -> str | None:
+    """The channel of `Decision.signals` that a topic holds; None for other topics."""
+    for row in CHANNELS.values():
+        if row.schema != ARRAY or row.feature is not None or row.name == "sim_state":
+            continue
+        before, blank, _ = row.topic.partition("{")
+        if not blank and topic == row.topic:
+            return row.name
+        if blank and topic.startswith(before) and "/" not in topic.removeprefix(before):
+            return f"{topic.removeprefix(before)}{row.name.partition('}')[2]}"
+    return None
 
 
 def operands(name: str) -> tuple[str, ...]:

@@ -49,6 +49,17 @@ class EpisodeMetadata:
     """How much of the episode was saved, where its recording was cut off; else empty."""
 
 
+@dataclass(frozen=True)
+class Signal:
+    """What was put on record beside the usual at some of the steps: what a gate measured, a push, a belief."""
+
+    times: Float[np.ndarray, "M"]
+    """Since the first observation [s]."""
+    values: Float[np.ndarray, "M D"]
+    names: tuple[str, ...]
+    """Of the components."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Episode:
     """A demonstration or rollout of T control steps, validated when made.
@@ -80,6 +91,8 @@ class Episode:
     metadata: EpisodeMetadata
     model_xml: str = ""
     """The MuJoCo model, mesh paths starting with `robosuite/`."""
+    signals: Mapping[str, Signal] = field(default_factory=dict)
+    """What else belongs on record (`Decision.signals`), by channel."""
     declared: bool | None = None
     """Whether the recording says that it ended in success, where a person may have had the last word."""
     start_memory: Mapping[str, np.ndarray] | None = None

@@ -6,7 +6,9 @@ from typing import Any
 _PUBLIC = {
     "IntentBelief": "lfd.interaction.intent",
     "NoResponse": "lfd.interaction.responses",
+    "ParticleBelief": "lfd.interaction.particles",
     "Plan": "lfd.interaction.stackelberg",
+    "RecedingHorizon": "lfd.interaction.receding_horizon",
     "SingularResponse": "lfd.interaction.responses",
     "best_response": "lfd.interaction.responses",
     "boltzmann_likelihood": "lfd.interaction.intent",

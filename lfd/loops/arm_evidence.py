@@ -14,19 +14,21 @@ import numpy as np
 from jaxtyping import Float
 
 from lfd.core.artifact import read_manifest, sha256
-from lfd.core.errors import InputError
+from lfd.core.errors import InputError, RecordingError
 from lfd.core.recipe import build
 from lfd.loops.cup_scenes import Placement
 from lfd.loops.plan_demonstrations import PlanRecipe
 from lfd.planning.arm_model import load_arm
 from lfd.planning.arm_planner import ArmPlanner
 from lfd.planning.kinematics import Arm
-from lfd.record.episode_file import read_episode, recipe_in, recordings_in
+from lfd.record.episode_file import SUFFIX, read_episode, recipe_in, recordings_in
 
 SAME = ("robot", "waypoints", "duration_s", "smoothness")
 """What all demonstrations of a source must have in common."""
 PREFIX = "joint_pos."
 """What names of the arm's joints begin with in a dataset."""
+TYPE = "`lfd plan datasets/cup_panda.toml --out DIR` records plans that keep their scenes; give that DIR"
+"""What to type for demonstrations that can be learned from."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +90,17 @@ def load_evidence(source: Path) -> Evidence:
     """
     if (source / "meta" / "info.json").is_file():
         paths, motions = _of_dataset(source)
+        recipes = [_recipe(path, source) for path in paths]
     else:
+        if source.is_dir() and not any(source.rglob(f"*{SUFFIX}")):
+            raise InputError(
+                f"{source} is neither recordings of plans nor a dataset of them: it holds no {SUFFIX} file and no "
+                f"meta/info.json; {TYPE}"
+            )
         paths = recordings_in([source])
-        motions = [_of_recording(path) for path in paths]
-    recipes = [_recipe(path) for path in paths]
+        # One by one: the first that keeps no scene ends it, before all are read.
+        read = [(_of_recording(path, source), _recipe(path, source)) for path in paths]
+        motions, recipes = [motion for motion, _ in read], [recipe for _, recipe in read]
     for path, (recipe, _) in zip(paths, recipes, strict=True):
         for key in SAME:
             if getattr(recipe, key) != getattr(recipes[0][0], key):
@@ -116,20 +125,23 @@ def resampled(motion: Float[np.ndarray, "N D"], waypoints: int) -> Float[np.ndar
     return np.stack([np.interp(wanted, seen, joint) for joint in motion.T], axis=1)
 
 
-def _recipe(path: Path) -> tuple[PlanRecipe, Placement]:
-    """What a recording was planned with, and its scene."""
+def _recipe(path: Path, source: Path) -> tuple[PlanRecipe, Placement]:
+    """What a recording of `source` was planned with, and its scene."""
     tables: dict[str, Any] = recipe_in(path)
     if "plan" not in tables or "scene" not in tables:
-        raise InputError(
-            f"{path} keeps no scene to plan in; `lfd plan datasets/cup_panda.toml --out DIR` records demonstrations "
-            "that do"
-        )
+        whose = "" if path == source else f"{source} is neither recordings of plans nor a dataset of them: "
+        raise InputError(f"{whose}{path} keeps no scene to plan in; {TYPE}")
     recipe = build(PlanRecipe, tables["plan"], f"{path} [plan]")
     return recipe, Placement.of(tables["scene"], f"{path} [scene]")
 
 
-def _of_recording(path: Path) -> Float[np.ndarray, "N D"]:
-    return np.array(read_episode(path).observations["joint_pos"])
+def _of_recording(path: Path, source: Path) -> Float[np.ndarray, "N D"]:
+    try:
+        return np.array(read_episode(path).observations["joint_pos"])
+    except RecordingError as error:
+        if path == source:
+            raise
+        raise RecordingError(f"{source} is not all recordings of plans: {error}; {TYPE}") from error
 
 
 def _of_dataset(root: Path) -> tuple[list[Path], list[Float[np.ndarray, "N D"]]]:

@@ -21,11 +21,13 @@ from jaxtyping import Float
 from lfd.core.errors import InputError, UnknownName
 from lfd.core.protocols import Progress, silent
 from lfd.loops.arm_candidates import Candidates, ranges_of
-from lfd.loops.arm_evidence import Evidence
+from lfd.loops.arm_evidence import SAME, Evidence
 from lfd.reward_learning.apprenticeship import apprenticeship
 from lfd.reward_learning.ascent import maximise
 from lfd.reward_learning.identifiable import identifiable_from_counts
 from lfd.reward_learning.margin_loop import max_margin_planning_loop
+from lfd.reward_learning.weight_belief import updated
+from lfd.rewards.factors import GaussianFactor, check_features
 from lfd.rewards.reward_artifact import Change, LinearReward
 
 COUNT = 60
@@ -116,8 +118,12 @@ def by_apprenticeship(problem: Problem) -> Learned:
         tolerance=CERTAIN,
         max_iterations=ITERATIONS,
     )
-    weights = found.planned_for[found.best - 1] if found.best else found.weights
-    measures = {"margin": float(found.margins[-1]), "distance_of_best": found.best_distance}
+    planned = np.array(found.planned_for).reshape(-1, len(problem.ranges))
+    away = np.linalg.norm(found.mus[1 : 1 + len(planned)] - problem.expert, axis=1)
+    away[planned[:, -1] <= LEAST_PRIOR * np.linalg.norm(planned, axis=1)] = np.inf  # such weights have no scale
+    has_scale = bool(np.isfinite(away).any())
+    weights = planned[int(away.argmin())] if has_scale else found.weights
+    measures = {"margin": float(found.margins[-1])} | ({"distance_of_best": float(away.min())} if has_scale else {})
     return Learned(weights, ("margin", found.margins), measures)
 
 
@@ -208,7 +214,9 @@ def learn(problem: Problem, method: str, evidence: Evidence) -> tuple[LinearRewa
         raise UnknownName("method", method, METHODS)
     found = METHODS[method](problem)
     weights = problem.weights(found.weights)
-    recipe, count = evidence.recipe, len(evidence.demonstrations)
+    covariance = _of_weights(problem, found)
+    factor = None if covariance is None else GaussianFactor.about(weights, covariance)
+    recipe, words = evidence.recipe, f"{len(evidence.demonstrations)} demonstrations, {method}"
     return LinearReward(
         features=problem.features,
         weights=weights,
@@ -219,9 +227,31 @@ def learn(problem: Problem, method: str, evidence: Evidence) -> tuple[LinearRewa
         smoothness=recipe.smoothness,
         method=method,
         measures=found.measures,
-        covariance=_of_weights(problem, found),
-        history=(Change(f"{count} demonstrations, {method}", (), tuple(map(float, weights))),),
+        covariance=covariance,
+        history=(Change(words, (), tuple(map(float, weights)), factor),),
     ), found
+
+
+def joined(old: LinearReward, learned: LinearReward) -> LinearReward:
+    """A reward after demonstrations that another one was learned from, by maximum entropy.
+
+    Raises `InputError` for another arm, other features or settings of the planner, and where demonstrations did not
+    tell the weights well enough to be evidence.
+    """
+    check_features(learned.features, old.features, "what is to be learned")
+    for key in SAME:
+        if getattr(old, key) != getattr(learned, key):
+            raise InputError(
+                f"the demonstrations were planned with {key} = {getattr(learned, key)}, the reward with "
+                f"{getattr(old, key)}; weights are comparable only for the same arm and planner"
+            )
+    change = learned.history[0]
+    if change.factor is None:
+        raise InputError(
+            f"{change.evidence}: these tell no spread of the weights, so that they cannot be joined with other "
+            "evidence; give more of them, or leave out --reward"
+        )
+    return updated(old, change.factor, change.evidence)
 
 
 def _of_weights(problem: Problem, found: Learned) -> Float[np.ndarray, "K K"] | None:

@@ -19,6 +19,7 @@ from lfd.experts.plan_follower import CONTROLLER, PlanFollower
 from lfd.loops.cup_scenes import Placement, draw_placement
 from lfd.planning.arm_model import load_arm
 from lfd.planning.arm_planner import SPREAD_RAD, ArmPlanner, Plan
+from lfd.planning.boltzmann import Demonstrator
 from lfd.planning.kinematics import Arm
 from lfd.record.demonstrations import begin_recordings, make_recorder
 from lfd.rewards.arm_features import arm_features
@@ -33,6 +34,10 @@ CUBE, ASIDE_M = "cube_joint0", (0.36, -0.36)
 """Lift's cube, and the corner of the table that it is put into: plans know nothing of it."""
 TRIES = 50
 """Random deviations that are tried until one touches nothing."""
+PROPOSALS = 1000
+"""Of each Markov chain that draws a demonstration; 80 draws for beta = 20 and 100 then remembered 0.003 at most."""
+REMEMBERED = 0.1
+"""Most that a draw may remember of the optimum that its chain began from."""
 PLAN_STREAM = 1
 """Part of the seed of plans; scenes have 0."""
 
@@ -65,6 +70,8 @@ class PlanRecipe:
     """Trajectories that the planner starts from."""
     noise_rad: float
     """Standard deviation in the middle of a smooth random deviation of each joint from the plan [rad]; 0 for none."""
+    rationality: float = 0.0
+    """beta of a demonstrator who picks trajectories with p ~ exp(-beta cost) [1/cost]; 0 for one who does the best."""
 
     def check(self, where: str) -> None:
         arm_features(self.features)
@@ -75,9 +82,14 @@ class PlanRecipe:
         for key in ("control_hz", "scenes", "per_scene", "starts", "duration_s", "smoothness"):
             if not 0 < getattr(self, key) < np.inf:
                 raise RecipeError(f"{where} {key} = {getattr(self, key)}: must be greater than 0 and finite")
-        for key in ("seed", "noise_rad"):
-            if getattr(self, key) < 0:
-                raise RecipeError(f"{where} {key} = {getattr(self, key)}: must not be negative")
+        for key in ("seed", "noise_rad", "rationality"):
+            if not 0 <= getattr(self, key) < np.inf:
+                raise RecipeError(f"{where} {key} = {getattr(self, key)}: must not be negative, and finite")
+        if self.noise_rad and self.rationality:
+            raise RecipeError(
+                f"{where} has noise_rad = {self.noise_rad} and rationality = {self.rationality}, two ways to deviate "
+                "from the optimum; set one of them to 0"
+            )
 
     @classmethod
     def of_reward(cls, reward: LinearReward, **others: Any) -> "PlanRecipe":
@@ -146,7 +158,8 @@ def demonstrate(
     with progress("plan", len(scenes)) as bar:
         planned = []
         for number, placement in enumerate(scenes):
-            planned.append(_planned(recipe, number, placement, world))
+            plan, ways = demonstrations_in(recipe, number, placement)
+            planned.append((plan, [PlanFollower(world.spec, way, plan.dt_s) for way in ways]))
             bar.advance()
     begin_recordings(out, used, recipe.seed)
     runs = [(placement, one) for placement, (_, many) in zip(scenes, planned, strict=True) for one in many]
@@ -169,15 +182,29 @@ def demonstrate(
     return Planned(len(tracks), failures, max(tracks), float(np.mean(costs)), min(clearances))
 
 
-def _planned(recipe: PlanRecipe, number: int, placement: Placement, world: World) -> tuple[Plan, list[PlanFollower]]:
-    """The plan in scene `number`, and what follows it, with its noise, in each repetition."""
-    rng = np.random.default_rng([PLAN_STREAM, recipe.seed, number])
+def demonstrations_in(
+    recipe: PlanRecipe, number: int, placement: Placement
+) -> tuple[Plan, list[Float[np.ndarray, "T D"]]]:
+    """The plan in scene `number`, and what the demonstrator does there, each time that it demonstrates.
+
+    Raises `LfdError` where the planner finds no way that touches nothing, and where draws cannot be had.
+    """
+    rng, weights = np.random.default_rng([PLAN_STREAM, recipe.seed, number]), np.array(recipe.weights)
     planner = recipe.planner(load_arm(recipe.robot), placement)
-    plan = planner.plan(np.array(recipe.weights), starts=recipe.starts, rng=rng)
+    plan = planner.plan(weights, starts=recipe.starts, rng=rng)
     if plan.collides:
         raise LfdError(f"scene {number}: the best of {recipe.starts} plans touches something; try more starts")
-    ways = [deviate(planner, plan.trajectory, recipe.noise_rad, rng) for _ in range(recipe.per_scene)]
-    return plan, [PlanFollower(world.spec, way, plan.dt_s) for way in ways]
+    if not recipe.rationality:
+        return plan, [deviate(planner, plan.trajectory, recipe.noise_rad, rng) for _ in range(recipe.per_scene)]
+    drawn, chains = Demonstrator(planner, weights, recipe.smoothness).draws(
+        plan.trajectory, rationality=recipe.rationality, count=recipe.per_scene, steps=PROPOSALS, rng=rng
+    )
+    if chains.remembered.max() > REMEMBERED:
+        raise LfdError(
+            f"scene {number}: after {PROPOSALS} proposals a draw for rationality = {recipe.rationality} still hangs on "
+            f"the optimum ({chains.remembered.max():.2f} of 1); choose a greater rationality"
+        )
+    return plan, list(drawn)
 
 
 def _run(

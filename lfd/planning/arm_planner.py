@@ -7,7 +7,7 @@ joints, and the best that touches nothing is the plan. Joint limits are never ex
 better plans.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 
 import numpy as np
@@ -43,6 +43,10 @@ GOAL_STIFFNESS = 300.0
 """rho of a free goal at first [1/m^2]."""
 GOAL_TOLERANCE_M = 1e-3
 """Distance to the goal up to which a plan has reached it [m]."""
+
+
+class TouchesSomething(InputError):
+    """The arm touches something where a plan should begin or end."""
 
 
 @dataclass(frozen=True)
@@ -109,49 +113,67 @@ class ArmPlanner:
         for name, posture in (("start", scene.start), ("goal", scene.goal)):
             free = self.clearance(np.repeat(posture[None, None], 2, axis=1))[0]
             if free < 0:
-                raise InputError(
+                raise TouchesSomething(
                     f"in the scene's {name} the arm is {-free:.3f} m inside a shape; move one or the other"
                 )
-        self._smoothness = smoothness * rest_to_rest(waypoints, self.dt_s)
-        self._moving = slice(1, waypoints if free_goal else waypoints - 1)
+        self._lambda, self._smoothness = smoothness, smoothness * rest_to_rest(waypoints, self.dt_s)
         self._quadratic = {
             "joint_speed": step_squares(waypoints, self.dt_s),
             "joint_jerk": jerk_squares(waypoints, self.dt_s),
         }
 
-    def rows(self, trajectories: Float[np.ndarray, "B T D"]) -> Float[np.ndarray, "B N K"]:
+    def rows(self, trajectories: Float[np.ndarray, "B T D"], dt_s: float | None = None) -> Float[np.ndarray, "B N K"]:
         """What each of the N = T - 1 decisions of some trajectories adds to the feature counts."""
         wanted = {name for feature in self.features_used for name in feature.channels}
-        channels = Motion(self.arm, trajectories, self.dt_s).channels(wanted)
-        return decision_rows(self.features_used, self.scene.places, channels, self.dt_s)
+        channels = Motion(self.arm, trajectories, dt_s or self.dt_s).channels(wanted)
+        return decision_rows(self.features_used, self.scene.places, channels, dt_s or self.dt_s)
 
     def features(self, trajectories: Float[np.ndarray, "B T D"]) -> Float[np.ndarray, "B K"]:
         """Feature counts of trajectories of this planner's duration."""
-        return self.rows(trajectories).sum(axis=1)
+        return self.features_of(trajectories, self.dt_s)
+
+    def features_of(self, trajectories: Float[np.ndarray, "B N D"], dt_s: float) -> Float[np.ndarray, "B K"]:
+        """Feature counts of trajectories whose waypoints are `dt_s` apart [s]."""
+        return self.rows(trajectories, dt_s).sum(axis=1)
+
+    def onwards(self, start: Float[np.ndarray, "D"], *, waypoints: int, duration_s: float) -> "ArmPlanner":
+        """The same planner from another start, with another number of waypoints and duration; raises what it does."""
+        return ArmPlanner(
+            self.arm,
+            replace(self.scene, start=start),
+            features=tuple(feature.name for feature in self.features_used),
+            waypoints=waypoints,
+            duration_s=duration_s,
+            smoothness=self._lambda,
+            free_goal=self._free_goal,
+        )
 
     def plan(
         self,
         weights: Float[np.ndarray, "K"],
         *,
         warm: Float[np.ndarray, "T D"] | None = None,
+        fixed: int = 1,
         starts: int = 8,
         rng: np.random.Generator | None = None,
     ) -> Plan:
         """The best trajectory found from `starts` starts: `warm`, or else the straight way, and random ones.
 
-        `rng` draws the random starts; one start needs none. Raises `InputError` for weights or a warm start that do
-        not fit.
+        The first `fixed` waypoints of `warm` stay as they are: with two of them, (q - qd dt, q), the plan begins in q
+        with the velocity qd. `rng` draws the random starts; one start needs none. Raises `InputError` for weights or a
+        warm start that do not fit.
         """
         began = perf_counter()
-        self._check(weights, warm, starts, rng)
+        self._check(weights, warm, starts, rng, fixed)
         first = self.straight() if warm is None else warm
         x = np.repeat(first[None], starts, axis=0)
         if rng is not None and starts > 1:
             x[1:] = self.random_starts(starts - 1, rng)
-        x[:, 0] = self.scene.start
+        x[:, :fixed] = self.scene.start if fixed == 1 else first[:fixed]
         if not self._free_goal:
             x[:, -1] = self.scene.goal
-        return self._descend(np.asarray(weights, dtype=float), x, began)
+        moving = slice(fixed, self.waypoints if self._free_goal else self.waypoints - 1)
+        return self._descend(np.asarray(weights, dtype=float), x, moving, began)
 
     def straight(self) -> Float[np.ndarray, "T D"]:
         """The straight way in joint space from start to goal, at rest at both ends: the prior's optimum."""
@@ -179,11 +201,11 @@ class ArmPlanner:
         free = clearance(poses.points[:, SPHERES:], self.arm.radius[SPHERES:], self._shapes)
         return free.reshape(len(fine), -1).min(axis=1)
 
-    def _descend(self, weights: np.ndarray, x: np.ndarray, began: float) -> Plan:
-        cost, inverse_metric = self._cost(weights, len(x)), self._inverse_metric(weights)
+    def _descend(self, weights: np.ndarray, x: np.ndarray, moving: slice, began: float) -> Plan:
+        cost, inverse_metric = self._cost(weights, len(x)), self._inverse_metric(weights, moving)
         evaluations, rounds = 0, 0
         while True:
-            x, found = self._settle(cost, inverse_metric, x)
+            x, found = self._settle(cost, inverse_metric, x, moving)
             evaluations, rounds = evaluations + found.evaluations, rounds + 1
             free, miss = self.clearance(x), self._miss(x)
             error = np.linalg.norm(miss, axis=1)
@@ -216,19 +238,19 @@ class ArmPlanner:
         )
 
     def _settle(
-        self, cost: TrajectoryCost, inverse_metric: np.ndarray, whole: np.ndarray
+        self, cost: TrajectoryCost, inverse_metric: np.ndarray, whole: np.ndarray, moving: slice
     ) -> tuple[Float[np.ndarray, "B T D"], Minima]:
         """Local minima of the cost from some trajectories, whose fixed ends stay."""
 
-        def of_moving(moving: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def of_moving(part: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             trajectories = whole[rows]
-            trajectories[:, self._moving] = moving
+            trajectories[:, moving] = part
             value, gradient = cost(trajectories, rows)
-            return value, np.ascontiguousarray(gradient[:, self._moving])
+            return value, np.ascontiguousarray(gradient[:, moving])
 
         found = minimise(
             of_moving,
-            whole[:, self._moving],
+            whole[:, moving],
             low=self.arm.low,
             high=self.arm.high,
             inverse_metric=inverse_metric,
@@ -237,7 +259,7 @@ class ArmPlanner:
             evaluations=EVALUATIONS,
         )
         settled = whole.copy()
-        settled[:, self._moving] = found.x
+        settled[:, moving] = found.x
         return settled, found
 
     def _cost(self, weights: np.ndarray, rows: int) -> TrajectoryCost:
@@ -258,13 +280,13 @@ class ArmPlanner:
             cost.multipliers, cost.goal_stiffness = np.zeros((rows, 3)), GOAL_STIFFNESS * scale
         return cost
 
-    def _inverse_metric(self, weights: np.ndarray) -> Float[np.ndarray, "M M"]:
+    def _inverse_metric(self, weights: np.ndarray, moving: slice) -> Float[np.ndarray, "M M"]:
         """Inverse Hessian, for each joint, of the prior and of those features that are quadratic in the joints."""
         metric = self._smoothness.copy()
         for feature, weight in zip(self.features_used, weights, strict=True):
             if weight < 0 and feature.name in self._quadratic:
                 metric -= 2.0 * weight * self._quadratic[feature.name]
-        return np.linalg.inv(metric[self._moving, self._moving])
+        return np.linalg.inv(metric[moving, moving])
 
     def _miss(self, x: np.ndarray) -> Float[np.ndarray, "B 3"]:
         """Where the gripper ends, from its goal [m]."""
@@ -273,7 +295,12 @@ class ArmPlanner:
         return forward(self.arm, x[:, -1]).points[:, GRIPPER] - self.scene.places.goal
 
     def _check(
-        self, weights: np.ndarray, warm: np.ndarray | None, starts: int, rng: np.random.Generator | None
+        self,
+        weights: np.ndarray,
+        warm: np.ndarray | None,
+        starts: int,
+        rng: np.random.Generator | None,
+        fixed: int,
     ) -> None:
         names = ", ".join(feature.name for feature in self.features_used)
         if np.shape(weights) != (len(self.features_used),) or not np.isfinite(weights).all():
@@ -283,3 +310,7 @@ class ArmPlanner:
             raise InputError(f"the warm start has shape {warm.shape} or is not finite; give one of shape {shape}")
         if starts < 1 or (starts > 1 and rng is None):
             raise InputError(f"starts = {starts}: give at least one start, and an rng for more than one")
+        if not 1 <= fixed <= self.waypoints - 2 or (fixed > 1 and warm is None):
+            raise InputError(
+                f"fixed = {fixed}: of {self.waypoints} waypoints 1 to {self.waypoints - 2} can stay as they are in warm"
+            )

@@ -46,6 +46,12 @@ class Dynamics:
     def _cumulated(self) -> Float[np.ndarray, "Z1"]:
         return np.concatenate([[0.0], np.cumsum(self.rows.data)])
 
+    @cached_property
+    def _possible(self) -> Int[np.ndarray, "Z"]:
+        """The number of each entry of `rows` that is not zero, in a dense table of its shape; ascending."""
+        rows = np.repeat(np.arange(self.actions * self.states), np.diff(self.rows.indptr))
+        return np.sort(rows * self.states + self.rows.indices)
+
     def expected(self, values: Float[np.ndarray, "S *rest"]) -> Float[np.ndarray, "A S *rest"]:
         """E[V(s') | s, a] = sum_s' p(s' | s, a) V(s')."""
         return (self._backward @ values).reshape(self.actions, self.states, *values.shape[1:])
@@ -58,9 +64,9 @@ class Dynamics:
         self, states: Int[np.ndarray, "N"], actions: Int[np.ndarray, "N"], following: Int[np.ndarray, "N"]
     ) -> Bool[np.ndarray, "N"]:
         """Whether p(s' | s, a) > 0, for N transitions."""
-        rows = np.repeat(np.arange(self.actions * self.states), np.diff(self.rows.indptr))
-        known = rows * self.states + self.rows.indices
-        return np.isin((actions * self.states + states) * self.states + following, known)
+        entry = (actions * self.states + states) * self.states + following
+        known = self._possible
+        return known[np.minimum(np.searchsorted(known, entry), len(known) - 1)] == entry
 
     def drawn(
         self, states: Int[np.ndarray, "N"], actions: Int[np.ndarray, "N"], rng: np.random.Generator

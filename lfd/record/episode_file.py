@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from lfd.core.artifact import versions
-from lfd.core.channels import ARRAY, CHANNELS, IMAGE, JOINT_STATE, POSE, channel
-from lfd.core.episode import Episode, EpisodeMetadata
+from lfd.core.channels import ARRAY, CHANNELS, IMAGE, JOINT_STATE, POSE, channel, signal_of
+from lfd.core.episode import Episode, EpisodeMetadata, Signal
 from lfd.core.errors import EpisodeError, RecordingError
 from lfd.core.protocols import Observation, Transition, World, WorldSpec, WorldState
 from lfd.core.rotations import wxyz_from_xyzw
@@ -253,11 +253,21 @@ def _decode(content: McapContent, about: dict[str, str], with_states: bool) -> E
             if topic.startswith(CAMERAS)
         },
         labels=labels,
+        signals={
+            name: _signal(messages, int(stamps[0]))
+            for topic, messages in content.messages.items()
+            if (name := signal_of(topic)) is not None and name not in labels and messages
+        },
         metadata=EpisodeMetadata(**metadata),
         model_xml=content.attachments[MODEL].decode(),
         declared=json.loads(content.metadata[END].get("success", "null")),
         start_memory=_memory(content.attachments.get(MEMORY)),
     )
+
+
+def _signal(messages: list[tuple[int, bytes]], start_ns: int) -> Signal:
+    names, values = arrays([data for _, data in messages])
+    return Signal((np.array([stamp for stamp, _ in messages], dtype=np.int64) - start_ns) / 1e9, values, names)
 
 
 def _memory(attached: bytes | None) -> Mapping[str, np.ndarray] | None:

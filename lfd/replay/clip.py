@@ -1,7 +1,7 @@
 """What a replay shows, whatever it comes from: curves over time, and the motion of a model."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mujoco
@@ -9,11 +9,14 @@ import numpy as np
 from jaxtyping import Float
 
 from lfd.core.channels import channel
-from lfd.core.episode import Episode
+from lfd.core.episode import Episode, Signal
 from lfd.core.errors import DatasetError, InputError, UnknownName
 from lfd.data.frames import load_frames
 from lfd.record.episode_file import read_episode, recording_in
 from lfd.worlds.cameras import load_model
+
+PATH = "_path"
+"""What channels end in that are ways of the gripper."""
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,18 @@ class Curve:
     values: Float[np.ndarray, "N D"]
     names: tuple[str, ...]
     unit: str
+    times: Float[np.ndarray, "N"] | None = None
+    """Where it has times of its own [s]; else the clip's."""
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """A force over time: where it acts, and what it is."""
+
+    origins: Float[np.ndarray, "N 3"]
+    """[m]"""
+    forces: Float[np.ndarray, "N 3"]
+    """[N]"""
 
 
 @dataclass(frozen=True)
@@ -40,6 +55,10 @@ class Clip:
     qpos: Float[np.ndarray, "N nq"] | None
     pictures: Mapping[str, tuple[bytes, ...]] = field(default_factory=dict)
     """Rerun path to the PNG of each row."""
+    arrows: Mapping[str, Arrow] = field(default_factory=dict)
+    """Name to a force at each row."""
+    plans: Mapping[str, tuple[tuple[float, Float[np.ndarray, "P 3"]], ...]] = field(default_factory=dict)
+    """Name to ways of the gripper [m], each from the time on at which it was planned [s]."""
 
 
 def clip_of(source: Path, episode: int) -> Clip:
@@ -69,7 +88,39 @@ def _clip_of_episode(episode: Episode, title: str) -> Clip:
     assert episode.sim_states is not None
     qpos = episode.sim_states[:, 1 : 1 + model.nq]  # mjSTATE_INTEGRATION begins with time, qpos
     pictures = {channel(f"{name}_picture").path: data for name, data in episode.pictures.items()}
-    return Clip(title, episode.times, curves, positions, model, qpos, pictures)
+    plans = {name: signal for name, signal in episode.signals.items() if name.endswith(PATH)}
+    curves |= dict(_signal_curve(name, signal) for name, signal in episode.signals.items() if name not in plans)
+    return Clip(
+        title,
+        episode.times,
+        curves,
+        positions,
+        model,
+        qpos,
+        pictures,
+        arrows=_arrows(episode),
+        plans={
+            name.removesuffix(PATH): tuple(
+                (float(t), row.reshape(-1, 3)) for t, row in zip(signal.times, signal.values, strict=True)
+            )
+            for name, signal in plans.items()
+        },
+    )
+
+
+def _signal_curve(name: str, signal: Signal) -> tuple[str, Curve]:
+    path, curve = _curve(name, signal.values, signal.names)
+    return path, replace(curve, times=signal.times)
+
+
+def _arrows(episode: Episode) -> dict[str, Arrow]:
+    """The force of a person who pushed, at the gripper."""
+    signal, gripper = episode.signals.get("push"), episode.observations.get("ee_pos")
+    if signal is None or gripper is None:
+        return {}
+    forces = np.zeros((len(episode.times), 3))
+    forces[np.searchsorted(episode.times, signal.times - 1e-6)] = signal.values[:, :3]
+    return {"push": Arrow(gripper, forces)}
 
 
 def _clip_of_dataset(root: Path, episode: int) -> Clip:

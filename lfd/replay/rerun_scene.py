@@ -21,11 +21,26 @@ from lfd.replay.clip import Clip
 VISUAL_GROUP = 1  # robosuite's group of the geoms that are meant to be seen
 SHAPES = mujoco.mjtGeom
 HIDDEN = ("wall", "floor")
-FIRST_PLOTS = ("plots/action/applied", "plots/joints/position", "plots/gripper/position")
-PATH_COLORS = {"ee": (60, 130, 246)}
+FIRST_PLOTS = (
+    ("plots/weights", "plots/push", "plots/external_torque"),
+    ("plots/belief", "plots/belief_entropy", "plots/action/applied"),
+    ("plots/action/applied", "plots/joints/position", "plots/gripper/position"),
+)
+"""What is seen at once, by kind of episode: corrections, interactions, all others. The first that it has counts."""
+PATH_COLORS = {"ee": (60, 130, 246), "a": (60, 130, 246), "planned": (22, 163, 74)}
 EYE = (1.05, -0.85, 1.45)
 """From where a clip is seen [m]: the robot's front and right."""
+LOOK_AT = (-0.15, 0.05, 0.9)
+"""Where that eye looks [m]."""
+ABOVE_ROAD = (-14.0, -9.0, 9.0)
+"""From where a car is followed [m]."""
 OBJECT_COLOR = (234, 88, 12)
+PLAN_COLORS = {"planned": (107, 114, 128), "deformed": (234, 88, 12), "new": (22, 163, 74)}
+PUSH_COLOR = (220, 38, 38)
+M_PER_N = 0.01
+"""Length of a force's arrow."""
+TICK_S = 1e-6
+"""Less than any step: times are rounded to it when they are looked up."""
 SHAPE_COLOR = (110, 110, 110, 160)
 """Of what a plan keeps clear of."""
 
@@ -50,6 +65,8 @@ def replay(clip: Clip, *, save: Path | None, overwrite: bool = False, shapes: Se
         _log_motion(recording, clip.model, clip.qpos, clip.times)
     _log_scene(recording, shapes)
     _log_paths(recording, clip)
+    _log_plans(recording, clip)
+    _log_arrows(recording, clip)
     _log_curves(recording, clip)
     _log_pictures(recording, clip)
     recording.flush()
@@ -78,9 +95,10 @@ def _blueprint(clip: Clip) -> rrb.Blueprint:
         unit = clip.curves[path].unit
         return rrb.TimeSeriesView(name=path.removeprefix("plots/") + (f" [{unit}]" if unit else ""), origin=path)
 
-    first = [path for path in FIRST_PLOTS if path in clip.curves]
+    kinds = [[path for path in kind if path in clip.curves] for kind in FIRST_PLOTS]
+    first = next((kind for kind, whole in zip(kinds, FIRST_PLOTS, strict=True) if whole[0] in kind), kinds[-1])
     others = [path for path in clip.curves if path not in first]
-    scene = scene_view(EYE)
+    scene = scene_view(EYE) if not _drives(clip) else scene_view(ABOVE_ROAD, follows="world/robot_car")
     if clip.pictures:
         pictures = [rrb.Spatial2DView(name=path.removeprefix("cameras/"), origin=path) for path in clip.pictures]
         scene = rrb.Vertical(scene, rrb.Horizontal(*pictures), row_shares=[3, 2])
@@ -92,14 +110,20 @@ def _blueprint(clip: Clip) -> rrb.Blueprint:
     )
 
 
-def scene_view(eye: tuple[float, float, float]) -> rrb.Spatial3DView:
-    """The table with the robot, seen from the point `eye` [m]."""
+def _drives(clip: Clip) -> bool:
+    return clip.model is not None and mujoco.mj_name2id(clip.model, mujoco.mjtObj.mjOBJ_BODY, "robot_car") >= 0
+
+
+def scene_view(eye: tuple[float, float, float], follows: str | None = None) -> rrb.Spatial3DView:
+    """The table with the robot, seen from the point `eye` [m]; or what moves, followed from there."""
     return rrb.Spatial3DView(
         name="scene",
         origin="world",
         background=(245, 245, 245),
         line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=(-0.15, 0.05, 0.9)),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=LOOK_AT)
+        if follows is None
+        else rrb.EyeControls3D(position=eye, look_target=(0.0, 0.0, 0.0), tracking_entity=follows),
     )
 
 
@@ -236,10 +260,32 @@ def _log_paths(recording: rr.RecordingStream, clip: Clip) -> None:
         recording.log(f"world/paths/{name}/now", rr.Points3D.from_fields(radii=[0.006], colors=[color]), static=True)
 
 
+def _log_plans(recording: rr.RecordingStream, clip: Clip) -> None:
+    """Ways by a plan, each as long as it holds."""
+    for name, ways in clip.plans.items():
+        color = PLAN_COLORS.get(name, OBJECT_COLOR)
+        for time_s, way in ways:
+            recording.set_time("time", duration=time_s)
+            recording.set_time("step", sequence=int(np.searchsorted(clip.times, time_s - TICK_S)))
+            recording.log(f"world/plans/{name}", rr.LineStrips3D([way], colors=[color], radii=[0.004]))
+    recording.reset_time()
+
+
+def _log_arrows(recording: rr.RecordingStream, clip: Clip) -> None:
+    for name, arrow in clip.arrows.items():
+        columns = rr.Arrows3D.columns(origins=arrow.origins, vectors=M_PER_N * arrow.forces)
+        recording.send_columns(f"world/arrows/{name}", indexes=_clock(clip.times), columns=columns)
+        recording.log(f"world/arrows/{name}", rr.Arrows3D.from_fields(colors=[PUSH_COLOR], radii=[0.008]), static=True)
+
+
 def _log_curves(recording: rr.RecordingStream, clip: Clip) -> None:
     for path, curve in clip.curves.items():
         recording.log(path, rr.SeriesLines(names=list(curve.names)), static=True)
-        recording.send_columns(path, indexes=_clock(clip.times), columns=rr.Scalars.columns(scalars=curve.values))
+        clock = _clock(clip.times)
+        if curve.times is not None:
+            steps = np.searchsorted(clip.times, curve.times - TICK_S)
+            clock = [rr.TimeColumn("time", duration=curve.times), rr.TimeColumn("step", sequence=steps)]
+        recording.send_columns(path, indexes=clock, columns=rr.Scalars.columns(scalars=curve.values))
 
 
 def _log_pictures(recording: rr.RecordingStream, clip: Clip) -> None:

@@ -8,10 +8,13 @@ import numpy as np
 from lfd.core.artifact import versions
 from lfd.core.episode import Episode
 from lfd.core.errors import RecordingError
-from lfd.core.protocols import Observation, Transition, World, WorldState
+from lfd.core.protocols import Observation, Policy, Transition, World, WorldState
 from lfd.experts.playback import PlaybackPolicy
+from lfd.experts.pushing import PushedArm, RecordedPerson
+from lfd.interaction.driving_people import BoltzmannDriver
 from lfd.record.episode_file import read_episode, recording_in
-from lfd.worlds.robosuite_world import make_world
+from lfd.worlds.driving_world import SCENES, DrivingWorld, load_scene
+from lfd.worlds.robosuite_world import RobosuiteWorld, make_world
 from lfd.worlds.rollout import rollout
 
 DECISIVE = ("mujoco", "robosuite", "numpy")
@@ -64,12 +67,12 @@ def verify_episode(episode: Episode) -> Verification:
     about = episode.metadata
     if episode.sim_states is None or episode.start_memory is None:
         raise RecordingError("the episode has no simulation states; only recordings of lfd can be replayed exactly")
-    world = make_world(about.task, about.robot, about.control_hz, about.stepper, controller=about.controller)
+    world, policy = _world_of(episode), PlaybackPolicy(episode.actions)
     start = WorldState(model_xml=episode.model_xml, sim=episode.sim_states[0], memory=episode.start_memory)
     states = _States()
     rollout(
         world,
-        PlaybackPolicy(episode.actions),
+        policy if not isinstance(world, RobosuiteWorld) else _pushed(policy, world, episode),
         [states],
         np.random.default_rng(0),
         horizon=len(episode),
@@ -87,3 +90,21 @@ def verify_episode(episode: Episode) -> Verification:
         stepper=about.stepper,
         differences=tuple(f"{n}: recorded with {there[n]}, here {here[n]}" for n in names if there[n] != here[n]),
     )
+
+
+def _world_of(episode: Episode) -> World:
+    """The world that an episode was recorded in."""
+    about = episode.metadata
+    if about.task in SCENES:
+        scene = load_scene(about.task)
+        people = BoltzmannDriver(scene, "random", about.recipe["interact"]["rationality"])
+        return DrivingWorld(scene, people, about.control_hz)
+    return make_world(about.task, about.robot, about.control_hz, about.stepper, controller=about.controller)
+
+
+def _pushed(policy: Policy, world: RobosuiteWorld, episode: Episode) -> Policy:
+    """The policy, with the pushes that are on record."""
+    push = episode.signals.get("push")
+    if push is None:
+        return policy
+    return PushedArm(policy, RecordedPerson("recorded", push.times, push.values), world, np.inf)

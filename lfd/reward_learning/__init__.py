@@ -18,6 +18,7 @@ from lfd.reward_learning.maxent_sampled import MaxEntSampled, SampledTrajectorie
 from lfd.reward_learning.maxent_tabular import MaxEnt, maxent_tabular, maxent_tabular_objective
 from lfd.reward_learning.preference_posterior import PreferencePosterior
 from lfd.reward_learning.queries import Query, best_batch, best_query, query_values, worth_asking
+from lfd.reward_learning.weight_belief import WeightBelief, belief_of, undone, updated, weights_about
 
 _WITH_TORCH = ("LaplaceMaxEnt", "laplace_log_likelihood", "maxent_laplace")
 
@@ -37,8 +38,10 @@ __all__ = [
     "Query",
     "SampledTrajectories",
     "SolverFailed",
+    "WeightBelief",
     "action_losses",
     "apprenticeship",
+    "belief_of",
     "best_batch",
     "best_query",
     "correction_update",
@@ -57,7 +60,10 @@ __all__ = [
     "maxent_tabular_objective",
     "one_feature_update",
     "query_values",
+    "undone",
     "unvisited_losses",
+    "updated",
+    "weights_about",
     "worth_asking",
 ]
 

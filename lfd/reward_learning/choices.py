@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-Choice = Literal["a", "b", "equal"]
+from lfd.rewards.factors import Choice
+
 Likelihood = Literal["bradley_terry", "sadigh2017", "hard"]
-CHOICES: tuple[Choice, ...] = ("a", "b", "equal")
 LIKELIHOODS: tuple[Likelihood, ...] = ("bradley_terry", "sadigh2017", "hard")
 
 

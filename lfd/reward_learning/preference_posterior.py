@@ -17,9 +17,10 @@ from jaxtyping import Float
 from scipy.special import ndtr
 
 from lfd.core.errors import InputError, UnknownName
-from lfd.reward_learning.choices import CHOICES, LIKELIHOODS, Choice, Likelihood, log_likelihood
+from lfd.reward_learning.choices import LIKELIHOODS, Likelihood, log_likelihood
 from lfd.reward_learning.slice_sampling import elliptical_steps
 from lfd.rewards.checked_arrays import finite_array
+from lfd.rewards.factors import CHOICES, Choice
 
 Prior = Literal["sphere", "ball"]
 PARTICLES = 1024

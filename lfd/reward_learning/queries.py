@@ -24,6 +24,7 @@ from lfd.rewards.checked_arrays import finite_array
 Criterion = Literal["information_gain", "volume_removal", "expected_volume"]
 AT_ONCE = 2_000_000
 """Numbers that are computed at a time, so that a large pool does not fill the memory."""
+ALL_ALIKE = "all trajectories have the same features: no question teaches anything; add other trajectories"
 
 
 class Query(NamedTuple):
@@ -83,31 +84,47 @@ def best_batch(
     rationality: float,
     among: int = 200,
 ) -> list[Query]:
+    """Questions to be asked together, of all pairs i < j of N trajectories: see `joint_batch`."""
+    features = finite_array("features", features, ("N", "K"))
+    samples = finite_array("samples", samples, ("M", features.shape[1]))
+    first, second = np.triu_indices(len(features), 1)
+    different = (features[first] != features[second]).any(axis=1)
+    if not different.any():
+        raise InputError(ALL_ALIKE)
+    first, second = first[different], second[different]
+    chosen = joint_batch(features[first] - features[second], samples, size, rationality=rationality, among=among)
+    return [Query(int(first[q]), int(second[q]), gain) for q, gain in chosen]
+
+
+def joint_batch(
+    differences: Float[np.ndarray, "Q K"],
+    samples: Float[np.ndarray, "M K"],
+    size: int,
+    *,
+    rationality: float,
+    among: int = 200,
+) -> list[tuple[int, float]]:
     """Questions to be asked together: each adds the most to what the answers to all tell about w, jointly.
 
-    Two that ask the same are not both chosen, since the second adds little. Greedy over the `among` best pairs, which
-    comes within 1 - 1/e of the best batch of these (information gain is submodular); the values are the bits that each
-    adds. Raises `InputError` for a size that is not positive or above 12: joint answers are counted, 2^size of them.
+    Their numbers, and the bits that each adds. Two that ask the same are not both chosen, since the second adds little.
+    Greedy over the `among` best, which comes within 1 - 1/e of the best batch of these (information gain is
+    submodular). Raises `InputError` for a size that is not positive or above 12: joint answers are counted, 2^size of
+    them.
     """
     if not 1 <= size <= 12:
         raise InputError(f"size = {size}: a batch has 1 to 12 questions")
-    features = finite_array("features", features, ("N", "K"))
-    samples = finite_array("samples", samples, ("M", features.shape[1]))
-    _check(samples, "information_gain", rationality)
-    first, second, values = _all_pairs(features, samples, "information_gain", rationality)
+    values = query_values(differences, samples, rationality=rationality)
     pool = np.argsort(-values)[:among]
-    pool = pool[np.isfinite(values[pool])]
-    x = rationality * ((features[first[pool]] - features[second[pool]]) @ samples.T)
-    chances, noise = expit(x), _mean_entropy(x)
-    joint, entropy, chosen = np.ones((1, len(samples))), 0.0, list[Query]()  # p(answers so far | w_m), of (2^b, M)
+    x = rationality * (differences[pool] @ samples.T)
+    chances, noise, left = expit(x), _mean_entropy(x), np.ones(len(pool), dtype=bool)
+    joint, entropy, chosen = np.ones((1, len(samples))), 0.0, list[tuple[int, float]]()  # p(answers | w_m), (2^b, M)
     for _ in range(min(size, len(pool))):
         with_a = chances @ joint.T / len(samples)
-        with_b = joint.mean(axis=1) - with_a
+        with_b = np.maximum(0.0, joint.mean(axis=1) - with_a)
         entropies = -(xlogy(with_a, with_a) + xlogy(with_b, with_b)).sum(axis=1) / np.log(2.0)
-        best = int((entropies - noise).argmax())
-        gain = float(entropies[best] - entropy - noise[best])
-        chosen.append(Query(int(first[pool[best]]), int(second[pool[best]]), gain))
-        entropy = float(entropies[best])
+        best = int(np.where(left, entropies - noise, -np.inf).argmax())
+        chosen.append((int(pool[best]), float(entropies[best] - noise[best] - entropy)))
+        entropy, left[best] = float(entropies[best]), False
         joint = np.concatenate([joint * chances[best], joint * (1.0 - chances[best])])
     return chosen
 
@@ -138,9 +155,7 @@ def _all_pairs(
         values[pairs] = _worth(returns[first[pairs]] - returns[second[pairs]], criterion)
     values[(features[first] == features[second]).all(axis=1)] = -np.inf
     if not np.isfinite(values).any():
-        raise InputError(
-            "all trajectories have the same features: no question teaches anything; add other trajectories"
-        )
+        raise InputError(ALL_ALIKE)
     return first, second, values
 
 

@@ -47,7 +47,17 @@ def feature_expectations(phis: Sequence[Shaped[np.ndarray, "..."]], *, discount:
     features = np.shape(phis[0])[-1] if np.ndim(phis[0]) else "K"
     checked_discount(discount)
     tables = [finite_array(f"phi of trajectory {i}", phi, ("T", features)) for i, phi in enumerate(phis)]
-    counts = np.array([feature_counts(table, discount=discount) for table in tables])
-    n = len(counts)
-    error = counts.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(counts.shape[1], np.nan)
-    return FeatureExpectations(mean=counts.mean(axis=0), standard_error=error, trajectories=n)
+    return expectations_of_counts([feature_counts(table, discount=discount) for table in tables])
+
+
+def expectations_of_counts(counts: Sequence[Float[np.ndarray, "K"]]) -> FeatureExpectations:
+    """Mean and standard error of f(tau_i), one row for each of n trajectories.
+
+    Raises `InputError` for rows of different lengths.
+    """
+    if len({len(row) for row in counts}) > 1:
+        i = next(i for i, row in enumerate(counts) if len(row) != len(counts[0]))
+        raise InputError(f"trajectory {i} has {len(counts[i])} features, trajectory 0 has {len(counts[0])}")
+    table, n = np.array(counts), len(counts)
+    error = table.std(axis=0, ddof=1) / np.sqrt(n) if n > 1 else np.full(table.shape[1], np.nan)
+    return FeatureExpectations(mean=table.mean(axis=0), standard_error=error, trajectories=n)

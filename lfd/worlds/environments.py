@@ -6,6 +6,8 @@ import xml.etree.ElementTree as ET
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 from lfd.worlds.robots import RobotConfig
 from lfd.worlds.tasks import Task
 
@@ -66,9 +68,13 @@ def controller_configs(robot: RobotConfig) -> Any:
 
     arms = REGISTERED_ROBOTS[robot.robosuite_name].arms
     config: Any = load_composite_controller_config(controller="BASIC", robot=robot.robosuite_name)
-    parts = {arm: load_part_controller_config(default_controller=robot.controller) for arm in arms}
+    name = robot.controller.removeprefix("FULL_")
+    parts = {arm: load_part_controller_config(default_controller=name) for arm in arms}
     for arm, part in parts.items():
         part |= {key: config["body_parts"][arm][key] for key in ("gripper", "input_type", "input_ref_frame")}
+    if name != robot.controller:
+        for part, full in zip(parts.values(), np.split(np.array(robot.full_torque_n_m), len(arms)), strict=True):
+            part |= {"output_max": full, "output_min": -full}
     config["body_parts"] = parts
     return config
 

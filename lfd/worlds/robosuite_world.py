@@ -137,6 +137,18 @@ class RobosuiteWorld:
         reward, _, _ = self._env._post_action(action)
         return StepResult(self._observe(), float(reward), bool(self._env._check_success()), clipped)
 
+    def push(self, body: str, wrench: Float[np.ndarray, "6"]) -> None:
+        """Let a force [N] and a torque [N m] act at a body's centre of mass, in the world frame, until told otherwise.
+
+        They are part of the physics' state. Raises `InputError` for a body that the model does not have, or numbers
+        that are not finite.
+        """
+        found = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, body)
+        if found < 0 or np.shape(wrench) != (6,) or not np.isfinite(wrench).all():
+            names = ", ".join(self._model.body(i).name for i in range(1, self._model.nbody))
+            raise InputError(f"cannot push {body!r} with {wrench}: give six finite numbers, and one of {names}")
+        self._data.xfrc_applied[found] = wrench
+
     def sim_state(self) -> Float[np.ndarray, "_"]:
         """MuJoCo's mjSTATE_INTEGRATION now."""
         state = np.empty(len(self._before))

@@ -15,12 +15,14 @@ CONTROLLERS = {
     "JOINT_POSITION": (),
     "JOINT_VELOCITY": (),
     "JOINT_TORQUE": (),
+    "FULL_JOINT_TORQUE": (),
 }
 """Arm controllers and the names of their action components.
 
 OSC: changes of the grip site's pose in the frame of the robot's base, as fractions of the controller's output
 range (0.05 m and 0.5 rad). JOINT: one component for each joint of the arm, as a fraction of 0.05 rad (a change of
-position), 0.5 rad/s or 0.1 N m (beside gravity)."""
+position), 0.5 rad/s or 0.1 N m (beside gravity). FULL_JOINT_TORQUE is robosuite's JOINT_TORQUE with the joint's largest
+torque in the place of 0.1 N m: what an impedance controller of one's own needs."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +32,9 @@ class RobotConfig:
     robosuite_name: str
     """Name of the robot in robosuite, for example Panda."""
     controller: str
-    """Controller of the arm: OSC_POSE, OSC_POSITION, JOINT_POSITION, JOINT_VELOCITY or JOINT_TORQUE."""
+    """Controller of the arm, one of `CONTROLLERS`."""
+    full_torque_n_m: tuple[float, ...] = ()
+    """Torque of each joint at full action of FULL_JOINT_TORQUE [N m]; `load_robot` takes the model's largest."""
 
     def check(self, where: str) -> None:
         if self.controller not in CONTROLLERS:
@@ -56,6 +60,8 @@ class RobotModel:
     """Highest position of each joint of the arm; inf where it turns freely [rad]."""
     torque_n_m: tuple[float, ...]
     """Largest torque at each joint of the arm [N m]."""
+    push_n: float = 40.0
+    """Largest force with which a person may push the arm; what is beyond is clipped [N]."""
 
     def check(self, where: str) -> None:
         sizes = {key: len(getattr(self, key)) for key in ("home_rad", "low_rad", "high_rad", "torque_n_m")}
@@ -105,7 +111,8 @@ def load_robot(name: str) -> RobotConfig:
 
     Raises `UnknownName` with the names of all configs.
     """
-    return build(RobotConfig, _table(name, "robot"), f"{_path(name)} [robot]")
+    told = {"full_torque_n_m": list(load_model(name).torque_n_m)} | _table(name, "robot")
+    return build(RobotConfig, told, f"{_path(name)} [robot]")
 
 
 def load_model(name: str) -> RobotModel:

@@ -1,0 +1,202 @@
+"""The command with which a person corrects an arm by pushing it.
+
+It imports its stage when it runs, so that `lfd --help` answers at once.
+"""
+
+import json
+from argparse import Namespace
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+
+from lfd.commands.demonstrations import live_view
+from lfd.commands.options import Commands, Result, count, output, short
+from lfd.core.errors import InputError
+
+CORRECTION_TASKS = ("cup", "table", "laptop", "person")
+"""Names of `lfd.loops.correction_tasks`, which is imported when the command runs."""
+CORRECTION_RULES = ("one", "all", "confident")
+RESPONSES = ("learn", "deform", "impedance")
+SCRIPTED, DEVICE = "scripted", "device"
+DEMONSTRATIONS = 10
+
+
+def add(commands: Commands) -> None:
+    """The command of this module."""
+    made = commands.add(
+        "correct",
+        run_correct,
+        "push an arm while it carries out its plan, and it learns what you care for",
+        "lfd correct laptop --out outputs/corrected --save corrected.rrd",
+    )
+    made.epilog += "\n         lfd correct table --person device --device spacemouse --out outputs/mine"
+    made.epilog += (
+        "\n         lfd correct cup --person outputs/corrected/recordings/episode_000000.mcap --out outputs/again"
+    )
+    made.add_argument(
+        "task", choices=CORRECTION_TASKS,
+        help="what the robot does not know: that the cup should be upright, low over the table, not over the "
+        "laptop, not near the person",
+    )  # fmt: skip
+    made.add_argument("--robot", default="panda", metavar="NAME", help="robot config (default: panda)")
+    made.add_argument(
+        "--person", default=SCRIPTED, metavar="scripted|device|FILE",
+        help="who pushes: somebody scripted, who has weights of their own (default); you, with --device; the pushes of "
+        "a recording, again",
+    )  # fmt: skip
+    made.add_argument(
+        "--device", default="keyboard", metavar="DEVICE",
+        help="with --person device: keyboard, spacemouse or gamepad; its deflection is the force (default: keyboard)",
+    )  # fmt: skip
+    made.add_argument("--no-view", action="store_true", help="with --person device: no live view of the robot")
+    made.add_argument("--runs", type=count, default=2, metavar="N", help="ways from start to goal (default: 2)")
+    made.add_argument(
+        "--rule", choices=CORRECTION_RULES, default="one",
+        help="how weights learn: the one feature that changed most, all, or all as far as features explain the push",
+    )  # fmt: skip
+    made.add_argument("--step", type=float, default=4.0, metavar="B", help="size of the update (default: 4)")
+    made.add_argument(
+        "--response", choices=RESPONSES, default="learn",
+        help="what a push changes: the weights and the plan (learn), the plan (deform), or nothing (impedance)",
+    )  # fmt: skip
+    made.add_argument("--reward", type=Path, metavar="OLD", help="a reward to begin with, that `lfd correct` wrote")
+    made.add_argument(
+        "--dataset", type=Path, metavar="DIR",
+        help="afterwards also carry out what was learned, undisturbed and with small deviations, and convert it to a "
+        "dataset that policies can be trained on",
+    )  # fmt: skip
+    made.add_argument(
+        "--demonstrations", type=count, metavar="N", help=f"of --dataset: how many (default: {DEMONSTRATIONS})"
+    )
+    made.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the scene, the person and noise")
+    made.add_argument("--save", type=Path, metavar="X.rrd", help="also write the first run as a Rerun file")
+    output(made, "the recordings and the reward")
+
+
+def run_correct(given: Namespace) -> Result:
+    """A reward from pushes."""
+    from lfd.core.artifact import check_output, new_folder, sha256
+    from lfd.loops.correcting import (
+        CorrectionRecipe,
+        correct,
+        learned_reward,
+        learner_of,
+        make_correction_world,
+        report_of,
+        set_up,
+        start_reward,
+        weights_by_push,
+    )
+    from lfd.loops.correction_results import demonstrate_learned, weights_picture
+    from lfd.replay.clip import clip_of
+    from lfd.replay.rerun_scene import replay
+    from lfd.rewards.reward_artifact import load_reward, save_reward
+    from lfd.terminal import progress_bar
+
+    check_output(given.out, overwrite=given.overwrite)
+    if given.save is not None and given.save.exists() and not given.overwrite:
+        raise InputError(f"{given.save} exists already; choose another --save, or add --overwrite to replace it")
+    if given.dataset is None and given.demonstrations is not None:
+        raise InputError("--demonstrations is for a dataset: name its folder with --dataset DIR")
+    if given.dataset is not None:
+        check_output(given.dataset, overwrite=given.overwrite)
+    recipe = CorrectionRecipe(
+        task=given.task, robot=given.robot, runs=given.runs, seed=given.seed, rule=given.rule, step=given.step,
+        response=given.response,
+    )  # fmt: skip
+    recipe.check("lfd correct")
+    reward = start_reward(recipe) if given.reward is None else load_reward(given.reward)
+    learner = learner_of(reward, recipe)
+    setup = set_up(recipe)
+    world = make_correction_world(recipe)
+    with new_folder(given.out, overwrite=given.overwrite) as part, _person(given, recipe, setup) as person:
+        runs = correct(
+            recipe,
+            setup,
+            learner,
+            person.pushes,
+            world,
+            out=part / "recordings",
+            observers=person.observers,
+            around=person.around,
+            progress=progress_bar,
+        )
+        weights = weights_by_push(runs, reward.weights)
+        report = report_of(recipe, setup, runs, weights, judged=given.person == SCRIPTED)
+        learned = learned_reward(reward, learner)
+        parents = {str(given.out / "recordings"): sha256(part / "recordings")}
+        if given.reward is not None:
+            parents[str(given.reward)] = sha256(given.reward)
+        save_reward(
+            learned,
+            part / "reward",
+            recipe={"task": given.task, "rule": given.rule, "step": given.step},
+            parents=parents,
+            seed=given.seed,
+            also={
+                "weights.png": weights_picture(weights, learned),
+                "report.json": json.dumps(report, indent=2).encode(),
+            },
+        )
+    if given.save is not None:
+        clip = clip_of(given.out / "recordings", 0)
+        replay(clip, save=given.save, overwrite=given.overwrite, shapes=setup.planner.scene.shapes)
+        report["saved"] = str(given.save)
+    if given.dataset is not None:
+        report["dataset"] = demonstrate_learned(
+            recipe, learned, given.dataset, given.demonstrations or DEMONSTRATIONS,
+            overwrite=given.overwrite, progress=progress_bar,
+        )  # fmt: skip
+    return {"out": str(given.out), **(report if given.json else _shown(report))}
+
+
+class _Seat:
+    """Who pushes, and what their being a person takes."""
+
+    def __init__(
+        self,
+        pushes: Any,
+        observers: Callable[[], list[Any]] = list,
+        around: Callable[[Any], Any] = lambda policy: policy,
+    ):
+        self.pushes, self.observers, self.around = pushes, observers, around
+
+
+@contextmanager
+def _person(given: Namespace, recipe: Any, setup: Any) -> Iterator[_Seat]:
+    """Who pushes."""
+    from lfd.loops.correcting import scripted
+    from lfd.loops.correction_results import recorded_person
+
+    if given.person == SCRIPTED:
+        yield _Seat(scripted(recipe, setup))
+    elif given.person == DEVICE:
+        from lfd.experts.pushing import DevicePerson
+        from lfd.experts.registry import open_device
+        from lfd.loops.correction_results import Watching
+        from lfd.record.pacing import Paced
+        from lfd.terminal import StatusLine
+        from lfd.worlds.robots import load_model, load_teleop
+
+        with open_device(given.device) as device, live_view(not given.no_view) as view, closing(StatusLine()) as status:
+            person = DevicePerson(device, load_teleop(recipe.robot).frame, load_model(recipe.robot).push_n)
+            yield _Seat(
+                person,
+                observers=lambda: [Watching(view, status)],
+                around=lambda policy: Paced(policy, recipe.control_hz),
+            )
+    else:
+        yield _Seat(recorded_person(Path(given.person)))
+
+
+def _shown(report: Result) -> Result:
+    """A report as lines of a table."""
+    told = dict(report)
+    steps = told.pop("weights")
+    for name in steps[0]:
+        told[name] = " -> ".join(f"{row[name]:.3g}" for row in steps)
+    for key in ("regret", "cosine"):
+        if key in told:
+            told[key] = f"{short(told[key])}, before and after each push"
+    return told
