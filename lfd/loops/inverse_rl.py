@@ -121,9 +121,11 @@ def by_apprenticeship(problem: Problem) -> Learned:
     planned = np.array(found.planned_for).reshape(-1, len(problem.ranges))
     away = np.linalg.norm(found.mus[1 : 1 + len(planned)] - problem.expert, axis=1)
     away[planned[:, -1] <= LEAST_PRIOR * np.linalg.norm(planned, axis=1)] = np.inf  # such weights have no scale
-    has_scale = bool(np.isfinite(away).any())
-    weights = planned[int(away.argmin())] if has_scale else found.weights
-    measures = {"margin": float(found.margins[-1])} | ({"distance_of_best": float(away.min())} if has_scale else {})
+    smoothest = np.linalg.norm(problem.straight - problem.expert)
+    weights, distance = np.append(np.zeros(len(problem.features)), 1.0), float(smoothest)  # of the straight way
+    if len(away) and away.min() < smoothest:
+        weights, distance = planned[int(away.argmin())], float(away.min())
+    measures = {"margin": float(found.margins[-1]), "distance_of_best": distance}
     return Learned(weights, ("margin", found.margins), measures)
 
 

@@ -32,8 +32,8 @@ EYE = (1.05, -0.85, 1.45)
 """From where a clip is seen [m]: the robot's front and right."""
 LOOK_AT = (-0.15, 0.05, 0.9)
 """Where that eye looks [m]."""
-ABOVE_ROAD = (-14.0, -9.0, 9.0)
-"""From where a car is followed [m]."""
+ROBOT_CAR, BEHIND_CAR, AHEAD_OF_CAR = "world/robot_car", (-16.0, -9.0, 10.0), (4.0, 1.5, 0.0)
+"""The robot as a car, from where it is followed, and where that eye looks, in its frame [m]."""
 OBJECT_COLOR = (234, 88, 12)
 PLAN_COLORS = {"planned": (107, 114, 128), "deformed": (234, 88, 12), "new": (22, 163, 74)}
 PUSH_COLOR = (220, 38, 38)
@@ -98,7 +98,7 @@ def _blueprint(clip: Clip) -> rrb.Blueprint:
     kinds = [[path for path in kind if path in clip.curves] for kind in FIRST_PLOTS]
     first = next((kind for kind, whole in zip(kinds, FIRST_PLOTS, strict=True) if whole[0] in kind), kinds[-1])
     others = [path for path in clip.curves if path not in first]
-    scene = scene_view(EYE) if not _drives(clip) else scene_view(ABOVE_ROAD, follows="world/robot_car")
+    scene = scene_view(BEHIND_CAR, AHEAD_OF_CAR, ROBOT_CAR) if _drives(clip) else scene_view(EYE)
     if clip.pictures:
         pictures = [rrb.Spatial2DView(name=path.removeprefix("cameras/"), origin=path) for path in clip.pictures]
         scene = rrb.Vertical(scene, rrb.Horizontal(*pictures), row_shares=[3, 2])
@@ -111,19 +111,23 @@ def _blueprint(clip: Clip) -> rrb.Blueprint:
 
 
 def _drives(clip: Clip) -> bool:
-    return clip.model is not None and mujoco.mj_name2id(clip.model, mujoco.mjtObj.mjOBJ_BODY, "robot_car") >= 0
+    return (
+        clip.model is not None
+        and mujoco.mj_name2id(clip.model, mujoco.mjtObj.mjOBJ_BODY, ROBOT_CAR.removeprefix("world/")) >= 0
+    )
 
 
-def scene_view(eye: tuple[float, float, float], follows: str | None = None) -> rrb.Spatial3DView:
-    """The table with the robot, seen from the point `eye` [m]; or what moves, followed from there."""
+def scene_view(
+    eye: tuple[float, float, float], look_at: tuple[float, float, float] = LOOK_AT, origin: str = "world"
+) -> rrb.Spatial3DView:
+    """The world, seen from the point `eye` [m] in the frame of `origin`, which may move."""
     return rrb.Spatial3DView(
         name="scene",
-        origin="world",
+        origin=origin,
+        contents="world/**",
         background=(245, 245, 245),
         line_grid=False,
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=LOOK_AT)
-        if follows is None
-        else rrb.EyeControls3D(position=eye, look_target=(0.0, 0.0, 0.0), tracking_entity=follows),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=look_at),
     )
 
 
