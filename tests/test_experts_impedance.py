@@ -38,5 +38,5 @@ def test_the_action_is_a_spring_a_critical_damper_and_the_inertia(lift_world) ->
 
 
 def test_another_controller_is_refused(lift_world) -> None:
-    with pytest.raises(InputError, match='make_world\\(..., controller="FULL_JOINT_TORQUE"\\)'):
+    with pytest.raises(InputError, match='make_world\\(..., controller="JOINT_TORQUE_FULL"\\)'):
         Impedance(lift_world.spec, FULL)

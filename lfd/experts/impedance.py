@@ -15,7 +15,7 @@ from scipy.interpolate import CubicSpline
 from lfd.core.errors import InputError
 from lfd.core.protocols import WorldSpec
 
-CONTROLLER = "FULL_JOINT_TORQUE"
+CONTROLLER = "JOINT_TORQUE_FULL"
 STIFFNESS_1_RAD = 0.5
 """K as a share of a joint's largest torque: 40 N m/rad in Panda's shoulder."""
 

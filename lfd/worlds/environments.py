@@ -68,7 +68,7 @@ def controller_configs(robot: RobotConfig) -> Any:
 
     arms = REGISTERED_ROBOTS[robot.robosuite_name].arms
     config: Any = load_composite_controller_config(controller="BASIC", robot=robot.robosuite_name)
-    name = robot.controller.removeprefix("FULL_")
+    name = robot.controller.removesuffix("_FULL")
     parts = {arm: load_part_controller_config(default_controller=name) for arm in arms}
     for arm, part in parts.items():
         part |= {key: config["body_parts"][arm][key] for key in ("gripper", "input_type", "input_ref_frame")}

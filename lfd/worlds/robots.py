@@ -15,13 +15,13 @@ CONTROLLERS = {
     "JOINT_POSITION": (),
     "JOINT_VELOCITY": (),
     "JOINT_TORQUE": (),
-    "FULL_JOINT_TORQUE": (),
+    "JOINT_TORQUE_FULL": (),
 }
 """Arm controllers and the names of their action components.
 
 OSC: changes of the grip site's pose in the frame of the robot's base, as fractions of the controller's output
 range (0.05 m and 0.5 rad). JOINT: one component for each joint of the arm, as a fraction of 0.05 rad (a change of
-position), 0.5 rad/s or 0.1 N m (beside gravity). FULL_JOINT_TORQUE is robosuite's JOINT_TORQUE with the joint's largest
+position), 0.5 rad/s or 0.1 N m (beside gravity). JOINT_TORQUE_FULL is robosuite's JOINT_TORQUE with the joint's largest
 torque in the place of 0.1 N m: what an impedance controller of one's own needs."""
 
 
@@ -34,7 +34,7 @@ class RobotConfig:
     controller: str
     """Controller of the arm, one of `CONTROLLERS`."""
     full_torque_n_m: tuple[float, ...] = ()
-    """Torque of each joint at full action of FULL_JOINT_TORQUE [N m]; `load_robot` takes the model's largest."""
+    """Torque of each joint at full action of JOINT_TORQUE_FULL [N m]; `load_robot` takes the model's largest."""
 
     def check(self, where: str) -> None:
         if self.controller not in CONTROLLERS:
