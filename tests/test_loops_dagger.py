@@ -34,6 +34,7 @@ DAGGER_LIFT = ROOT / "policies" / "dagger_lift.toml"
 SMALL = (
     "train.steps=50", "eval.episodes=2", "eval.max_seconds=2.0", "policy.hidden_sizes=[16]",
     "dagger.rounds=2", "dagger.demonstrations=2", "dagger.episodes_per_round=2",
+    "dagger.beta=first",
 )  # fmt: skip
 SHORT = ("record.max_seconds=4.0",)
 
@@ -323,8 +324,11 @@ def test_recipes_that_cannot_be_used(given, error, says) -> None:
 def test_keys_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(RecipeError, match="before the last round, which last_steps is for: leave out one"):
         recipes("dagger.last_steps=10", "dagger.max_labels=100")
-    with pytest.raises(RecipeError, match=r"takes the coin's place: --set dagger\.beta=first"):
-        recipes("dagger.gate=human", "dagger.beta=linear")
+
+
+def test_a_gate_takes_the_coins_place_whatever_beta_says() -> None:
+    assert recipes("dagger.gate=human", "dagger.beta=linear", "dagger.rounds=3").dagger.betas == (1.0, 0.0, 0.0)
+    assert recipes("dagger.beta=linear", "dagger.rounds=3").dagger.betas == (1.0, 0.5, 0.0)
 
 
 def test_labels_are_what_is_learned_from() -> None:

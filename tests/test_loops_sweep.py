@@ -38,7 +38,7 @@ def test_loops_are_swept_as_well(tmp_path) -> None:
         ("steps = 4000", "steps = 20"), ("[256, 256]", "[8]"), ("rounds = 7", "rounds = 2"),
         ("demonstrations = 10", "demonstrations = 1"), ("episodes_per_round = 10", "episodes_per_round = 1"),
         ("episodes = 50", "episodes = 2"), ("max_seconds = 10.0", "max_seconds = 1.0"),
-        ("rollout_seconds = 4.0", "rollout_seconds = 1.0"),
+        ("rollout_seconds = 2.5", "rollout_seconds = 1.0"),
     ):  # fmt: skip
         assert before in text
         text = text.replace(before, after)

@@ -21,8 +21,7 @@ def add(commands: Commands) -> None:
         "lfd dagger policies/dagger_lift.toml --out outputs/dagger",
     )
     made.epilog += "\n         lfd dagger policies/dagger_lift.toml --set dagger.retrain=warm --out outputs/warm"
-    made.epilog += "\n         lfd dagger policies/dagger_lift.toml --set dagger.beta=first --device keyboard "
-    made.epilog += f"--out outputs/mine\n\n{HELP}"
+    made.epilog += f"\n         lfd dagger policies/dagger_lift.toml --device keyboard --out outputs/mine\n\n{HELP}"
     made.add_argument(
         "recipe", type=Path, metavar="RECIPE", help="policy recipe: [policy], [train], [eval] and [dagger] tables"
     )

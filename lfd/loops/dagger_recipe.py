@@ -105,8 +105,6 @@ class DaggerRecipe:
             raise RecipeError(f"{where} gate_share = {self.gate_share}: a gate needs a share between 0 and 1")
         if self.gate == HUMAN and (self.labels_per_round or self.max_labels):
             raise RecipeError(f"{where} a person's episodes are not cut off: leave out labels_per_round and max_labels")
-        if self.gate != "none" and self.beta != "first":
-            raise RecipeError(f'{where} gate = "{self.gate}" takes the coin\'s place: --set dagger.beta=first')
         if self.last_steps and self.max_labels:
             raise RecipeError(
                 f"{where} max_labels may end the loop before the last round, which last_steps is for: leave out one"
@@ -114,8 +112,8 @@ class DaggerRecipe:
 
     @property
     def betas(self) -> tuple[float, ...]:
-        """beta_i of every round."""
-        return beta_schedule(self.beta, self.rounds, rate=self.beta_rate)
+        """beta_i of every round; a gate takes the coin's place, but for the demonstrations."""
+        return beta_schedule(self.beta if self.gate == "none" else "first", self.rounds, rate=self.beta_rate)
 
 
 @dataclass(frozen=True, kw_only=True)
