@@ -178,6 +178,20 @@ def test_pushes_are_learned_once_each() -> None:
     assert learned_reward(reward, learner) is reward
 
 
+def test_a_belief_moves_as_the_weights_did_whatever_the_step_was() -> None:
+    recipe = CorrectionRecipe(task="cup")
+    reward = start_reward(recipe)
+    learner = learner_of(reward, replace(recipe, step=1.0))  # another step than the belief began with
+    way = np.zeros((4, 7))
+    for size in (0.4, -0.1):
+        learner.learn(
+            way, way + size, np.ones(7), lambda ways: ways.sum(axis=(1, 2))[:, None] * np.array([-0.3, 0, 0, 0])
+        )
+    learned = learned_reward(reward, learner)
+    assert len(learned.history) == 3
+    np.testing.assert_allclose(learned.weights, learner.weights, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_dataset_of_what_was_learned(corrected, tmp_path) -> None:
     found = call_json([

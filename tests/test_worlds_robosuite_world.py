@@ -261,3 +261,21 @@ def test_a_world_asks_for_little_memory_and_the_heaviest_task_needs_less(rng) ->
         world.step(rng.uniform(-1, 1, len(world.spec.action_low)))
     assert data.maxuse_arena < world._model.narena / 20
     assert world._model.narena <= 64 * 2**20
+
+
+def test_a_push_acts_until_told_otherwise_and_is_part_of_the_state(lift_world) -> None:
+    """A cube on the table, held up by its weight and half as much again: it rises at half of g."""
+    lift_world.reset(np.random.default_rng(3))
+    model = lift_world._model
+    weight = 9.81 * model.body("cube_main").mass[0]
+    lift_world.push("cube_main", np.array([0.0, 0.0, 1.5 * weight, 0.0, 0.0, 0.0]))
+    action = np.zeros_like(lift_world.spec.action_low)
+    start = lift_world.get_state()
+    heights = [lift_world.step(action).observation["cube_pos"][2] for _ in range(5)]
+    rise = np.diff(heights, n=2) * lift_world.spec.control_hz**2
+    np.testing.assert_allclose(rise, 0.5 * 9.81, rtol=0.05)
+    lift_world.set_state(start)
+    assert [lift_world.step(action).observation["cube_pos"][2] for _ in range(5)] == heights
+    with pytest.raises(InputError, match="no body 'cup' to push in Lift with panda"):
+        lift_world.push("cup", np.zeros(6))
+    lift_world.push("cube_main", np.zeros(6))

@@ -5,7 +5,7 @@ their own. Weights stay from run to run; the reward at the end has every push in
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from lfd.planning.arm_planner import ArmPlanner
 from lfd.planning.external_torque import ArmDynamics
 from lfd.record.demonstrations import begin_recordings, make_recorder
 from lfd.reward_learning.learning_from_pushes import RULES, PushLearner
-from lfd.reward_learning.weight_belief import updated
+from lfd.reward_learning.weight_belief import belief_of, updated
 from lfd.rewards.factors import GaussianFactor, PushFactor
 from lfd.rewards.reward_artifact import Change, LinearReward
 from lfd.run.correctable_arm import RESPONSES, CorrectableArm, Update
@@ -113,8 +113,6 @@ class Run:
     updates: list[Update]
     noticed_s: list[float]
     """When pushes were noticed."""
-    pushes: int
-    """Pushes that were noticed."""
     effort: float
     """Integral of the force, and of the torque over `LEVER_M` [N s]."""
     pushed_s: float
@@ -130,18 +128,14 @@ class Pushes:
     hz: int
     effort: float = 0.0
     pushed_s: float = 0.0
-    begins_s: list[float] = field(default_factory=list)
 
     def begin(self, world: World, observation: Any) -> None:
-        self._was = False
+        """Nothing to open."""
 
     def step(self, world: World, transition: Transition) -> None:
         push = np.array(list(transition.decision.signals["push"].values()))
         size = float(np.linalg.norm(push[:3]) + np.linalg.norm(push[3:]) / LEVER_M)
         self.effort, self.pushed_s = self.effort + size / self.hz, self.pushed_s + (size > 0) / self.hz
-        if size > 0 and not self._was:
-            self.begins_s.append(transition.step / self.hz)
-        self._was = size > 0
 
     def end(self, success: bool) -> None:
         """Nothing to close."""
@@ -243,7 +237,7 @@ def correct(
             run, outcome = _run(recipe, setup, learner, person, world, number, watching, around)
             run.effort, run.pushed_s, run.success = pushes.effort, pushes.pushed_s, outcome.success
             found.append(run)
-            bar.advance(note=f"{run.pushes} pushes, {'at the goal' if run.success else 'not at the goal'}")
+            bar.advance(note=f"{len(run.noticed_s)} pushes, {'at the goal' if run.success else 'not at the goal'}")
     return found
 
 
@@ -273,8 +267,7 @@ def _run(
     outcome = rollout(
         world, around(pushed), watching, rng, horizon=arm.horizon, hold_steps=arm.horizon + 1, start=start
     )
-    begins = arm.notice.begins
-    return Run(outcome.success, arm.updates, begins, len(begins), 0.0, 0.0, pushed.clipped), outcome
+    return Run(outcome.success, arm.updates, arm.notice.begins, 0.0, 0.0, pushed.clipped), outcome
 
 
 def scripted(recipe: CorrectionRecipe, setup: Setup) -> ScriptedPerson:
@@ -284,12 +277,12 @@ def scripted(recipe: CorrectionRecipe, setup: Setup) -> ScriptedPerson:
 
 
 def learned_reward(reward: LinearReward, learner: PushLearner) -> LinearReward:
-    """The reward with every push in its history, each as the factor whose MAP update it was."""
+    """The reward with every push in its history, each as the factor by which its belief moves as the weights did."""
     for number, learned in enumerate(learner.history, start=1):
         change = learned.after - learned.before
         if change.any():
             moved = ", ".join(f for f, x in zip(FEATURES, change, strict=True) if x)
-            factor = PushFactor(change * np.array(reward.ranges) ** 2 / learner.step)
+            factor = PushFactor(np.linalg.solve(belief_of(reward).covariance, change))
             reward = updated(reward, factor, f"push {number}, by the rule {learner.rule!r}: {moved}")
     return reward
 
@@ -305,7 +298,7 @@ def report_of(
     """What happened, as plain numbers; with regret and cosine where the person's weights are known."""
     updates = [update for run in runs for update in run.updates]
     report: dict[str, Any] = {
-        "pushes": sum(run.pushes for run in runs),
+        "pushes": sum(len(run.noticed_s) for run in runs),
         "reached_goal": sum(run.success for run in runs),
         "runs": len(runs),
         "effort_n_s": sum(run.effort for run in runs),

@@ -1,9 +1,9 @@
 """An arm that carries out its plan like a spring, notices when it is pushed, learns what was meant, and plans anew.
 
 At every control step: what the arm measures -> the torque of a push (`lfd.planning.external_torque`) -> is it one? ->
-every quarter of a second while it lasts, and when it ends: the rest of the plan is deformed to where the arm was pushed
-(`lfd.planning.deform`) -> what that says of the weights (`lfd.reward_learning.learning_from_pushes`) -> a new plan from
-here (`lfd.planning.replanning`) -> impedance control towards it (`lfd.experts.impedance`).
+while it lasts, the rest of the plan is deformed to where the arm is pushed (`lfd.planning.deform`); when it ends, what
+that says of the weights (`lfd.reward_learning.learning_from_pushes`), and a new plan from here
+(`lfd.planning.replanning`) -> impedance control towards it (`lfd.experts.impedance`).
 """
 
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from time import perf_counter
 import numpy as np
 from jaxtyping import Float
 
-from lfd.core.errors import UnknownName
+from lfd.core.errors import LfdError, UnknownName
 from lfd.core.protocols import Decision, Observation, Verdict, WorldSpec
 from lfd.experts.grippers import CLOSE
 from lfd.experts.impedance import Impedance, Reference
@@ -30,11 +30,9 @@ THRESHOLD_N_M = 1.5
 QUIET_S = 0.1
 """A push is over when the torque was below half the threshold for so long."""
 EVERY_S = 0.25
-"""Time between updates while a push lasts."""
+"""Time between deformations while a push lasts, and between tries to plan where the arm was stopped."""
 SETTLED_S = 0.2
 """From the start on, in which the observer settles and nothing counts as a push."""
-STRETCH = 1.0
-"""How much farther than where the arm is now the deformed rest goes, at the most: people push less than they want."""
 NEAR_M = 0.03
 """Distance of the gripper to the goal up to which the task is done."""
 GRACE_S = 0.5
@@ -47,11 +45,8 @@ PATH = 20
 
 @dataclass(frozen=True)
 class Update:
-    """What an update did."""
+    """What planning anew did."""
 
-    time_s: float
-    push: int
-    """Number of the push, from 1."""
     learned: Learned | None
     """None where nothing is learned from pushes."""
     planning_s: float
@@ -113,7 +108,11 @@ class CorrectableArm:
         noise: tuple[float, float] = (0.0, 0.0),
     ):
         """`planner` plans the whole motion with the learner's weights; `noise` is that of the arm's measured positions
-        [rad] and velocities [rad/s]. Raises `UnknownName` for another response, and what `Impedance` raises."""
+        [rad] and velocities [rad/s].
+
+        Raises `UnknownName` for another response, and what `Impedance` raises; `reset` raises `LfdError` where no plan
+        is found that touches nothing.
+        """
         if response not in RESPONSES:
             raise UnknownName("response to pushes", response, RESPONSES)
         self._spec, self._dynamics, self._planner = spec, dynamics, planner
@@ -131,6 +130,8 @@ class CorrectableArm:
         self._observer = MomentumObserver(self._dynamics, self._dt_s)
         self.notice, self.updates = PushNotice(self._dt_s), list[Update]()
         plan = self._planner.plan(self.learner.weights, starts=self._starts, rng=rng)
+        if plan.collides:
+            raise LfdError(f"the best of {self._starts} plans touches something; choose another --seed")
         self._reference = Reference(plan.trajectory, plan.dt_s)
         self._is_stopped = False
         self._correction: Correction | None = None
@@ -205,9 +206,9 @@ class CorrectableArm:
         self._plan_anew(now, q, qd, deformed, self.learner.learn(planned, corrected, push, since.features))
 
     def _deformed(self, planned: Float[np.ndarray, "N D"], away: Float[np.ndarray, "D"]) -> Float[np.ndarray, "N D"]:
-        """The rest, from where the arm was pushed, smoothly back to the goal."""
+        """The rest, smoothly to the goal, and no farther from the plan than the arm was pushed."""
         length = len(planned) - 1
-        scale = STRETCH / float(deformation_shape(length).max())
+        scale = 1.0 / float(deformation_shape(length).max())
         way = deform(planned, index=0, push=away, length=length, scale=scale)
         return np.clip(way, self._planner.arm.low, self._planner.arm.high)
 
@@ -224,17 +225,14 @@ class CorrectableArm:
         rest = self._rest(now)
         began = perf_counter()
         plan = rest.replan(self.learner.weights, position=q, velocity=qd, warm=warm)
-        self.updates.append(Update(now, len(self.notice.begins), learned, perf_counter() - began, plan is not None))
+        self.updates.append(Update(learned, perf_counter() - began, plan is not None))
         if plan is None:
             self._is_stopped = True
             self._reference = Reference(np.stack([q, q + 0.5 * STOP_S * qd]), STOP_S, begins_s=now, velocity=qd)
             return
         self._is_stopped = False
-        self._follow(Reference(plan.trajectory, plan.dt_s, begins_s=now, velocity=qd), plan.trajectory)
-
-    def _follow(self, reference: Reference, trajectory: Float[np.ndarray, "N D"]) -> None:
-        self._reference = reference
-        self._paths["new_path"] = self._path(trajectory)
+        self._reference = Reference(plan.trajectory, plan.dt_s, begins_s=now, velocity=qd)
+        self._paths["new_path"] = self._path(plan.trajectory)
 
     def _rest(self, now: float) -> Rest:
         return Rest(self._planner, max(self.duration_s - now, 2 * self._planner.dt_s))

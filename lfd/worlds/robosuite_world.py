@@ -138,15 +138,13 @@ class RobosuiteWorld:
         return StepResult(self._observe(), float(reward), bool(self._env._check_success()), clipped)
 
     def push(self, body: str, wrench: Float[np.ndarray, "6"]) -> None:
-        """Let a force [N] and a torque [N m] act at a body's centre of mass, in the world frame, until told otherwise.
+        """Let a force [N] and a torque [N m] act at a body's centre, in the world frame, until told otherwise.
 
-        They are part of the physics' state. Raises `InputError` for a body that the model does not have, or numbers
-        that are not finite.
+        They are part of the state. Raises `InputError` for a body that the model does not have.
         """
         found = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_BODY, body)
-        if found < 0 or np.shape(wrench) != (6,) or not np.isfinite(wrench).all():
-            names = ", ".join(self._model.body(i).name for i in range(1, self._model.nbody))
-            raise InputError(f"cannot push {body!r} with {wrench}: give six finite numbers, and one of {names}")
+        if found < 0:
+            raise InputError(f"no body {body!r} to push in {self.spec.task} with {self.spec.robot}")
         self._data.xfrc_applied[found] = wrench
 
     def sim_state(self) -> Float[np.ndarray, "_"]:
@@ -203,10 +201,7 @@ class RobosuiteWorld:
         return StepResult(self._observe(), float(reward), bool(self._env._check_success()))
 
     def settle(self) -> None:
-        """Let the arms' controllers take the present state for the one that a reset ended in.
-
-        It becomes their null-space posture, and the one whose Jacobian and pose the first control step still has.
-        """
+        """Let the arms' controllers take the present state for the one that a reset ended in, in every respect."""
         for owner, arm in arms_of(self._env):
             part = owner.composite_controller.part_controllers[arm]
             part.update_initial_joints(self._data.qpos[part.qpos_index])
@@ -301,11 +296,8 @@ class RobosuiteWorld:
         return parts
 
     def _memory(self) -> dict[str, np.ndarray]:
-        """What robosuite's Python objects remember.
-
-        The controllers' goals, filters and null-space targets, and the Jacobian and mass matrix that the first
-        substep after a reset still takes from their construction; where a reset placed what cannot move; which
-        dirt is wiped.
+        """What robosuite's Python objects remember: the controllers' goals, filters and null-space targets, and what
+        the first substep after a reset takes from their construction; where fixed things were placed; wiped dirt.
         """
         kept: dict[str, np.ndarray] = {}
         for part, holder in self._parts().items():
