@@ -1,5 +1,5 @@
 # Every target sets up .venv first. A Python >= 3.12 is enough; `uv` is used when it is there and installed into .venv when not.
-.PHONY: demo test lint type format results pictures system lock clean
+.PHONY: demo test lint type format results pictures docs system lock clean
 
 BIN := .venv/bin
 READY := .venv/ready
@@ -33,6 +33,9 @@ results: $(READY)
 
 pictures: $(READY)
 	$(BIN)/python docs/make_pictures.py
+
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # What cameras and pictures need beside Python, on Debian and Ubuntu: EGL with Mesa's CPU renderer, and a software Vulkan
 # driver for Rerun's viewer.

@@ -1,37 +1,76 @@
-"""Makes the pictures of the documentation from the demo's artifacts (`make pictures`, after `make demo`).
+"""Makes the pictures of Rerun in the documentation (`make pictures`): real artifacts in Rerun's page, in Chromium.
 
-Rerun's viewer runs without a screen; it needs a Vulkan driver (`make system`).
+What is shown is made first, into outputs/pictures, unless it is there. It works without a screen and without a graphics
+card; Chromium is the one of the system (`apt install chromium`).
 """
 
-import os
-import signal
-import subprocess
+import io
+import shutil
 import sys
-import time
+from collections.abc import Iterator
 from pathlib import Path
 
-from rerun.experimental import ViewerClient
+import numpy as np
+from PIL import Image
+from playwright.sync_api import Page, sync_playwright
 
-PORT = 9877
-NOTICES_S = 8.0  # the viewer shows notices in a corner when it starts
-ROLLOUT = Path("outputs/demo/rollout.rrd")
+from lfd.cli import main as lfd
+from lfd.loops.replaying import listing
+from lfd.replay.rerun_scene.outputs import Sheet, served
+
+MADE, PICTURES = Path("outputs/pictures"), Path("docs/pictures")
+ARGUMENTS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WIDTH, HEIGHT = 1200, 700
+STILL_MS, LONGEST_MS = 20_000, 600_000
+"""The page is finished when nothing of it has changed for so long; it may take this long."""
+COMMANDS = {
+    "recordings": ("record", "datasets/lift_panda.toml", "--episodes", "6", "--seed", "3"),
+    "corrected": ("correct", "laptop", "--runs", "1"),
+    "merge": ("interact", "merge", "--robot-kind", "obstacle", "active", "--episodes", "2"),
+    "preferred": ("compare", "datasets/cup_panda.toml", "--person", "simulated", "--questions", "3", "--plans", "12"),
+}
+"""What is shown, and how it is made."""
+SHOWN = {
+    "replay": ("recordings", (0,)),
+    "replay_beside": ("recordings", (0, 2, 3)),
+    "replay_correction": ("corrected", (0,)),
+    "replay_interaction": ("merge", (0, 2)),
+    "replay_comparison": ("preferred", (1,)),
+}
+"""Picture to what is seen on it: of which artifact, and the numbers of its episodes side by side."""
 
 
-def main() -> None:
-    """Write docs/pictures/replay.png."""
-    rerun = Path(sys.executable).with_name("rerun")
-    options = ["--headless", "--port", str(PORT), "--window-size", "1200x700"]
-    viewer = subprocess.Popen(
-        [rerun, ROLLOUT, *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
-    try:
-        time.sleep(NOTICES_S)
-        ViewerClient.connect(f"rerun+http://127.0.0.1:{PORT}/proxy").save_screenshot("docs/pictures/replay.png")
-        time.sleep(1.0)
-    finally:
-        os.killpg(viewer.pid, signal.SIGTERM)  # the command is a wrapper around the viewer
-        viewer.wait()
+def main(names: list[str]) -> None:
+    """Make the pictures of some names, or all."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        sys.exit("the pictures are taken in Chromium: apt install chromium")
+    for name in names or SHOWN:
+        source, numbers = SHOWN[name]
+        if not (MADE / source).is_dir() and lfd([*COMMANDS[source], "--out", str(MADE / source)]) != 0:
+            sys.exit(f"{source} cannot be made")
+        clips = tuple(clip for entry in listing(MADE / source).chosen(numbers).values() for clip in entry.open())
+        with served([Sheet(name, clips, plays=False)]) as address, sync_playwright() as play:
+            browser = play.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+            page.goto(address)
+            *_, last = _changes(page)
+            Image.fromarray(last).save(PICTURES / f"{name}.png", optimize=True)
+            browser.close()
+
+
+def _changes(page: Page) -> Iterator[np.ndarray]:
+    """The page, again whenever it has changed, until it stays as it is; then once more."""
+    before, still = np.zeros(0), 0
+    for _ in range(LONGEST_MS // 5000):
+        page.wait_for_timeout(5000)
+        now = np.asarray(Image.open(io.BytesIO(page.screenshot(timeout=LONGEST_MS))).convert("RGB"))
+        changed = now.shape != before.shape or np.abs(now.astype(int) - before).max() > 0
+        before, still = now.astype(int), 0 if changed else still + 5000
+        yield now
+        if still >= STILL_MS and np.unique(now.reshape(-1, 3), axis=0).shape[0] > 500:
+            return
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

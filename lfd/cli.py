@@ -10,6 +10,7 @@ from typing import Any
 
 from lfd.commands import (
     comparisons,
+    console,
     corrections,
     dagger,
     demonstrations,
@@ -130,6 +131,7 @@ def _parser() -> argparse.ArgumentParser:
         corrections,
         reward,
         interaction,
+        console,
         looking,
     ):
         group.add(commands)

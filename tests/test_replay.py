@@ -10,9 +10,11 @@ import pytest
 
 from lfd.core.errors import InputError
 from lfd.record.episode_file import read_episode, recordings_in
-from lfd.replay.clip import clip_of, load_model
-from lfd.replay.rerun_scene import replay, vertex_normals
+from lfd.replay.clip import clip_of
+from lfd.replay.rerun_scene import replay
+from lfd.replay.shown_mesh import vertex_normals
 from lfd.replay.verify import verify_episode, verify_replay
+from lfd.worlds.cameras import load_model
 from tests.conftest import call_json
 
 

@@ -194,7 +194,7 @@ def test_what_is_sent_arrives(lift_world, no_screen, tmp_path) -> None:
 
     held = columns(file)
     assert "/world/cube_main" in held
-    assert sum(batch.num_rows for batch in held["/world/robot0_right_hand"]) > 20
+    assert sum(batch.num_rows for batch in held["/world/robot0_link7"]) > 20
 
 
 def test_the_server_ends_also_when_the_process_is_killed(no_screen) -> None:

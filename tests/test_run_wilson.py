@@ -13,6 +13,12 @@ def test_the_interval_is_scipys(counts: tuple[int, int]) -> None:
     np.testing.assert_allclose(wilson_interval(*counts), (theirs.low, theirs.high), atol=1e-12)
 
 
+@given(st.integers(1, 500))
+def test_the_interval_holds_the_rate_itself_whatever_is_rounded(trials: int) -> None:
+    assert wilson_interval(0, trials)[0] == 0.0
+    assert wilson_interval(trials, trials)[1] == 1.0
+
+
 def test_it_solves_its_defining_equation() -> None:
     """Both ends p satisfy |p_hat - p| = z sqrt(p (1 - p) / n)."""
     for end in wilson_interval(45, 50):

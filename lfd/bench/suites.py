@@ -234,6 +234,27 @@ def _interaction(given: Namespace) -> tuple[Measured, Measured]:
     return as_dict(measured), sections_of(measured)
 
 
+def _replay(given: Namespace) -> tuple[Measured, Measured]:
+    from lfd.bench.replay import bench_replay
+
+    measured = asdict(
+        bench_replay(
+            task=given.task,
+            robot=given.robot,
+            repeats=3 if given.quick else 20,
+            pairs=2 if given.quick else 10,
+            every_kind=not given.quick,
+            seed=given.seed,
+            progress=progress_bar,
+        )
+    )
+    rows: Measured = {f"recording to Rerun file, {k}": f"{x:g}x real time" for k, x in measured["real_time"].items()}
+    rows |= {f"once for a model: {name}": f"{x:g} s" for name, x in measured["once"].items()}
+    rows |= {f"size: {kind}": f"{x:g} MB" for kind, x in measured["megabytes"].items()}
+    rows |= {f"--live: {name}": x for name, x in measured["live"].items()}
+    return measured, {f"Replay: {given.task} with {given.robot}": rows}
+
+
 SUITES: dict[str, Suite] = {
     "sim": _sim,
     "cameras": _cameras,
@@ -246,5 +267,6 @@ SUITES: dict[str, Suite] = {
     "comparisons": _comparisons,
     "corrections": _corrections,
     "interaction": _interaction,
+    "replay": _replay,
 }
 """Name to suite."""

@@ -3,7 +3,6 @@
 It imports its stage when it runs, so that `lfd --help` answers at once.
 """
 
-import json
 from argparse import Namespace
 from pathlib import Path
 from typing import Any
@@ -69,15 +68,13 @@ def run_compare(given: Namespace) -> Result:
     """A reward from comparisons."""
     from lfd.loops.comparing import ask
     from lfd.loops.comparison_people import FromFile
-    from lfd.loops.comparison_pictures import plan_clip, posterior_picture
-    from lfd.loops.comparison_result import plan_for, regret, report, shown
-    from lfd.replay.rerun_scene import replay
+    from lfd.loops.comparison_result import shown
+    from lfd.loops.comparison_session import finish
 
     if given.person not in (ME, SIMULATED):
         FromFile(Path(given.person), taken=0)  # before the pool is made: it takes a while
     folder = (_resumed if given.resume else _begun)(given)
     comparison = folder.comparison
-    pool = comparison.pool
     person, truth = _person(given, folder)
 
     def save(_: Any) -> None:
@@ -85,53 +82,30 @@ def run_compare(given: Namespace) -> Result:
         folder.save()
 
     ended = ask(comparison, person, questions=given.questions, stop_below=given.stop_below, save=save, tell=_tell)
-    reward = comparison.reward()
-    plan = plan_for(pool, reward.weights, scene=0, seed=comparison.rules.seed)
-    found = report(comparison, reward, plan, ended=ended, truth=truth)
-    if given.person == SIMULATED:
-        found["regret"] = regret(pool, plan, scene=0)
-    clip, shapes = plan_clip(pool, plan, 0)
-    replay(clip, save=given.out / "plan.rrd", overwrite=True, shapes=shapes)
-    folder.end(
-        ended=ended,
-        also={
-            "plan.rrd": (given.out / "plan.rrd").read_bytes(),
-            "report.json": json.dumps(found, indent=2).encode(),
-            "posterior.png": posterior_picture(comparison, reward, truth=truth, aligned=found.get("alignment", [])),
-        },
-    )
+    found = finish(folder, ended=ended, truth=truth)
     return {"out": str(given.out), **(found if given.json else shown(found))}
 
 
 def _begun(given: Namespace) -> Any:
     """The folder of a new comparison."""
-    from lfd.core.artifact import check_output, sha256
-    from lfd.loops.comparing import Comparison, Rules, no_answers_yet
-    from lfd.loops.comparison_folder import Folder
-    from lfd.loops.comparison_pool import make_pool
-    from lfd.rewards.factors import check_features
-    from lfd.rewards.reward_artifact import load_reward
+    from lfd.core.artifact import check_output
+    from lfd.loops.comparing import Rules
+    from lfd.loops.comparison_session import begin
     from lfd.terminal import progress_bar
 
     check_output(given.out, overwrite=given.overwrite)
     chosen = {key: getattr(given, key) for key in RULES if getattr(given, key) is not None}
-    rules = Rules(**{**RULES, **chosen})
-    old = load_reward(given.reward) if given.reward else None
-    if old is not None and given.features is not None:
-        check_features(given.features, old.features, "--features")
-    pool, parents = make_pool(
+    return begin(
+        given.out,
         given.pool,
-        features=given.features if old is None else old.features,
-        size=given.plans,
-        seed=rules.seed,
+        Rules(**{**RULES, **chosen}),
+        features=given.features,
+        plans=given.plans,
+        reward=given.reward,
         overrides=given.set,
+        overwrite=given.overwrite,
         progress=progress_bar,
     )
-    if old is not None:
-        parents = parents | {str(given.reward): sha256(given.reward)}
-    folder = Folder(given.out, parents, Comparison(pool, no_answers_yet(pool) if old is None else old, rules))
-    folder.begin(overwrite=given.overwrite)
-    return folder
 
 
 def _resumed(given: Namespace) -> Any:

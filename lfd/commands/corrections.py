@@ -3,9 +3,8 @@
 It imports its stage when it runs, so that `lfd --help` answers at once.
 """
 
-import json
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -76,22 +75,13 @@ def add(commands: Commands) -> None:
 
 def run_correct(given: Namespace) -> Result:
     """A reward from pushes."""
-    from lfd.core.artifact import check_output, new_folder, sha256
-    from lfd.loops.correcting import (
-        CorrectionRecipe,
-        correct,
-        learned_reward,
-        learner_of,
-        make_correction_world,
-        report_of,
-        set_up,
-        start_reward,
-        weights_by_push,
-    )
-    from lfd.loops.correction_results import demonstrate_learned, weights_picture
+    from lfd.core.artifact import check_output, sha256
+    from lfd.loops.correcting import CorrectionRecipe, learner_of, set_up, start_reward
+    from lfd.loops.correction_results import demonstrate_learned
+    from lfd.loops.correction_session import correct_into
     from lfd.replay.clip import clip_of
     from lfd.replay.rerun_scene import replay
-    from lfd.rewards.reward_artifact import load_reward, save_reward
+    from lfd.rewards.reward_artifact import load_reward
     from lfd.terminal import progress_bar
 
     check_output(given.out, overwrite=given.overwrite)
@@ -107,37 +97,18 @@ def run_correct(given: Namespace) -> Result:
     )  # fmt: skip
     recipe.check("lfd correct")
     reward = start_reward(recipe) if given.reward is None else load_reward(given.reward)
-    learner = learner_of(reward, recipe)
+    learner_of(reward, recipe)  # a reward that does not fit shows before the scene is made
     setup = set_up(recipe)
-    world = make_correction_world(recipe)
-    with new_folder(given.out, overwrite=given.overwrite) as part, _person(given, recipe, setup) as person:
-        runs = correct(
+    with _person(given, recipe, setup) as seat:
+        report, learned = correct_into(
+            given.out,
             recipe,
             setup,
-            learner,
-            person.pushes,
-            world,
-            out=part / "recordings",
-            observers=person.observers,
-            around=person.around,
+            reward,
+            seat,
+            parents={} if given.reward is None else {str(given.reward): sha256(given.reward)},
+            overwrite=given.overwrite,
             progress=progress_bar,
-        )
-        weights = weights_by_push(runs, reward.weights)
-        report = report_of(recipe, setup, runs, weights, judged=given.person == SCRIPTED)
-        learned = learned_reward(reward, learner)
-        parents = {str(given.out / "recordings"): sha256(part / "recordings")}
-        if given.reward is not None:
-            parents[str(given.reward)] = sha256(given.reward)
-        save_reward(
-            learned,
-            part / "reward",
-            recipe={"task": given.task, "rule": given.rule, "step": given.step},
-            parents=parents,
-            seed=given.seed,
-            also={
-                "weights.png": weights_picture(weights, learned),
-                "report.json": json.dumps(report, indent=2).encode(),
-            },
         )
     if given.save is not None:
         clip = clip_of(given.out / "recordings", 0)
@@ -151,26 +122,15 @@ def run_correct(given: Namespace) -> Result:
     return {"out": str(given.out), **(report if given.json else _shown(report))}
 
 
-class _Seat:
-    """Who pushes, and what their being a person takes."""
-
-    def __init__(
-        self,
-        pushes: Any,
-        observers: Callable[[], list[Any]] = list,
-        around: Callable[[Any], Any] = lambda policy: policy,
-    ):
-        self.pushes, self.observers, self.around = pushes, observers, around
-
-
 @contextmanager
-def _person(given: Namespace, recipe: Any, setup: Any) -> Iterator[_Seat]:
+def _person(given: Namespace, recipe: Any, setup: Any) -> Iterator[Any]:
     """Who pushes."""
     from lfd.loops.correcting import scripted
     from lfd.loops.correction_results import recorded_person
+    from lfd.loops.correction_session import Seat
 
     if given.person == SCRIPTED:
-        yield _Seat(scripted(recipe, setup))
+        yield Seat(scripted(recipe, setup), has_known_weights=True)
     elif given.person == DEVICE:
         from lfd.experts.pushing import DevicePerson
         from lfd.experts.registry import open_device
@@ -181,13 +141,13 @@ def _person(given: Namespace, recipe: Any, setup: Any) -> Iterator[_Seat]:
 
         with open_device(given.device) as device, live_view(not given.no_view) as view, closing(StatusLine()) as status:
             person = DevicePerson(device, load_teleop(recipe.robot).frame, load_model(recipe.robot).push_n)
-            yield _Seat(
+            yield Seat(
                 person,
                 observers=lambda: [Watching(view, status)],
                 around=lambda policy: Paced(policy, recipe.control_hz),
             )
     else:
-        yield _Seat(recorded_person(Path(given.person)))
+        yield Seat(recorded_person(Path(given.person)))
 
 
 def _shown(report: Result) -> Result:

@@ -17,12 +17,14 @@ from lfd.commands.options import (
     Result,
     cluster,
     count,
+    live,
     machines,
     output,
     overrides,
     parallel,
     put,
     short,
+    watching,
 )
 from lfd.core.errors import InputError
 from lfd.experts.keys import HELP
@@ -59,6 +61,7 @@ def _record(commands: Commands) -> None:
     )  # fmt: skip
     made.add_argument("--no-view", action="store_true", help="with --device: no live view of the robot")
     made.add_argument("--resume", action="store_true", help="go on with the recordings of the folder")
+    live(made, "the worlds in motion, and how many demonstrations succeeded so far")
     made.epilog += f"\n         lfd record datasets/lift_panda.toml --device keyboard --out outputs/mine\n\n{HELP}"
     parallel(made)
     output(made, "the recordings")
@@ -75,16 +78,19 @@ def run_record(given: Namespace) -> Result:
     put(tables, "record", episodes=given.episodes, seed=given.seed)
     recipe = build(RecordRecipe, tables.get("record", {}), f"{given.recipe} [record]")
     if given.device is not None:
+        if given.live:
+            raise InputError(f"with --device {given.device} you see the robot already: leave out --live")
         return _record_person(given, recipe, tables)
     if given.no_view:
         raise InputError("--no-view is for people: choose their device with --device keyboard, spacemouse or gamepad")
-    with machines(given.cluster) as cluster:
+    with watching(given, "recording") as observers, machines(given.cluster) as cluster:
         done = record(
             recipe,
             given.out,
             tables=tables,
             most_worlds=given.worlds,
             cluster=cluster,
+            observers=observers,
             resume=given.resume,
             overwrite=given.overwrite,
             progress=progress_bar,

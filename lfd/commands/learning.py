@@ -7,7 +7,20 @@ from argparse import Namespace
 from dataclasses import asdict
 from pathlib import Path
 
-from lfd.commands.options import Commands, Result, cluster, machines, output, overrides, parallel, put, short
+from lfd.commands.options import (
+    Commands,
+    Result,
+    cluster,
+    live,
+    machines,
+    output,
+    overrides,
+    parallel,
+    put,
+    short,
+    watching,
+    watching_curves,
+)
 
 
 def add(commands: Commands) -> None:
@@ -37,6 +50,7 @@ def _train(commands: Commands) -> None:
     made.add_argument(
         "--resume", action="store_true", help="go on from the last checkpoint of a training that was interrupted"
     )
+    live(made, "the curves as they grow")
     output(made, "the policy")
     overrides(made)
 
@@ -54,18 +68,20 @@ def run_train(given: Namespace) -> Result:
     put(tables, "train", steps=given.steps, seed=given.seed)
     recipe = build(TrainRecipe, tables.get("train", {}), f"{given.recipe} [train]")
     tried = build(EvalRecipe, tables.get("eval", {}), f"{given.recipe} [eval]")
-    done = train(
-        tables.get("policy", {}),
-        recipe,
-        given.dataset,
-        given.out,
-        tables=tables,
-        init=given.init,
-        judge=rollout_judge(tried, recipe.judge_episodes) if recipe.judge_episodes else None,
-        resume=given.resume,
-        overwrite=given.overwrite,
-        progress=progress_bar,
-    )
+    with watching_curves(given) as report:
+        done = train(
+            tables.get("policy", {}),
+            recipe,
+            given.dataset,
+            given.out,
+            tables=tables,
+            init=given.init,
+            judge=rollout_judge(tried, recipe.judge_episodes) if recipe.judge_episodes else None,
+            report=report,
+            resume=given.resume,
+            overwrite=given.overwrite,
+            progress=progress_bar,
+        )
     return {"out": str(given.out), **asdict(done)}
 
 
@@ -87,6 +103,7 @@ def _eval(commands: Commands) -> None:
         "--dataset", type=Path, metavar="DATASET",
         help="what a policy of lerobot-train was trained on, if it has been moved",
     )  # fmt: skip
+    live(made, "the worlds in motion, and the success so far")
     parallel(made)
     output(made, "the report and the recordings of all episodes")
 
@@ -102,7 +119,7 @@ def run_evaluate(given: Namespace) -> Result:
     tables = about_policy(given.policy, given.dataset)["recipe"]
     put(tables, "eval", episodes=given.episodes, seed=given.seed)
     recipe = build(EvalRecipe, tables["eval"], f"{given.policy} [eval]")
-    with machines(given.cluster) as cluster:
+    with watching(given, "evaluation") as observers, machines(given.cluster) as cluster:
         done = evaluate(
             given.policy,
             recipe,
@@ -112,6 +129,7 @@ def run_evaluate(given: Namespace) -> Result:
             dataset=given.dataset,
             most_worlds=given.worlds,
             cluster=cluster,
+            observers=observers,
             overwrite=given.overwrite,
             progress=progress_bar,
         )

@@ -4,12 +4,15 @@ A command's arguments stand beside the function that runs it, in the other modul
 """
 
 import argparse
+import os
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from lfd.core.errors import InputError
 
 Result = dict[str, Any]
 ALL_WORLDS = 2**16
@@ -73,6 +76,48 @@ def parallel(made: Any) -> None:
         help="worlds to run in parallel at the most; the result is the same (default: one a core)",
     )  # fmt: skip
     cluster(made)
+
+
+def live(made: Any, what: str) -> None:
+    """Being watched while it runs."""
+    made.add_argument(
+        "--live", action="store_true",
+        help=f"show {what}, in a browser on this machine (127.0.0.1 only, no internet needed)",
+    )  # fmt: skip
+
+
+@contextmanager
+def watching(given: argparse.Namespace, title: str) -> Iterator[Any]:
+    """What watches the episodes of a run, if that was asked for."""
+    from lfd.core.protocols import unwatched
+
+    if not given.live:
+        yield unwatched
+        return
+    if given.cluster is not None:
+        raise InputError("--live shows worlds of this machine, --cluster runs them elsewhere: leave out one of them")
+    from lfd.replay.live_worlds import live_worlds
+
+    with live_worlds(title, min(given.worlds, os.cpu_count() or 1), tell_live) as shown:
+        yield shown.observers
+
+
+@contextmanager
+def watching_curves(given: argparse.Namespace) -> Iterator[Any]:
+    """What takes the rows of a training's curve, if that was asked for."""
+    is_first = os.environ.get("RANK", "0") == "0"  # of the processes that torchrun starts
+    if not (given.live and is_first):
+        yield None
+        return
+    from lfd.replay.live_worlds import live_curves
+
+    with live_curves(tell_live) as report:
+        yield report
+
+
+def tell_live(address: str) -> None:
+    """Say where a person can look."""
+    print(f"live: {address}\n(over SSH: forward both ports, see docs/replay.md)", file=sys.stderr, flush=True)
 
 
 @contextmanager

@@ -171,6 +171,16 @@ class Observer(Protocol):
         ...
 
 
+Observers = Callable[[int], Sequence[Observer]]
+"""From the number of an episode to what else watches it."""
+
+
+def unwatched(index: int) -> Sequence[Observer]:
+    """Nothing else watches an episode."""
+    del index
+    return ()
+
+
 @runtime_checkable
 class UnitMap(Protocol):
     """Runs a function over units of work on other machines (`lfd.cluster`)."""

@@ -80,7 +80,7 @@ class TeleopPolicy:
             self.word = word
 
     def _action(self, state: DeviceState, ee_quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "Da"]:
-        config, turn = self._config, _base_from_device(self._config.frame, ee_quat)
+        config, turn = self._config, base_from_device(self._config.frame, ee_quat)
         move = config.position_gain * (turn @ beyond(state.translation, config.dead_band))
         rotate = config.rotation_gain * (turn @ beyond(state.rotation, config.dead_band))
         hand = SPEEDS[self._speed] * np.concatenate([move, rotate])[: self._moved]
@@ -92,7 +92,7 @@ def beyond(deflection: Float[np.ndarray, "3"], dead_band: float) -> Float[np.nda
     return np.sign(deflection) * np.maximum(np.abs(deflection) - dead_band, 0.0) / (1.0 - dead_band)
 
 
-def _base_from_device(frame: str, ee_quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+def base_from_device(frame: str, ee_quat: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
     """R_base_device: it maps a device's directions to those of the robot's base."""
     if frame == "gripper":
         return matrix_from_wxyz(ee_quat) @ DOWNWARDS

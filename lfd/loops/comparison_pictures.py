@@ -1,6 +1,7 @@
 """What a comparison shows: the two paths of a question, the plan that it ends with, the belief as curves."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from io import BytesIO
 
@@ -39,6 +40,19 @@ def question_clip(pool: Pool, question: Question) -> tuple[Clip, tuple[Shape, ..
     paths = {"a": np.concatenate([a, np.repeat(a[-1:], ROWS, axis=0)])}
     paths["b"] = np.concatenate([np.repeat(b[:1], ROWS, axis=0), b])
     return _clip(pool, scene, f"question {question.number + 1}: first A, blue, then B, orange", motions, paths)
+
+
+def pair_clips(pool: Pool, question: Question) -> tuple[Clip, Clip]:
+    """A and B of a question, each moving in a clip of its own; their curves lie over one another."""
+    scene = int(pool.scene_of[question.a])
+    made = []
+    for name, number in (("a", question.a), ("b", question.b)):
+        motion = resampled(pool.trajectories[number], ROWS)
+        path = forward(pool.arm, motion).points[:, GRIPPER]
+        clip, shapes = _clip(pool, scene, name.upper(), [motion], {name: path})
+        curves = {place: replace(curve, names=(name.upper(),)) for place, curve in clip.curves.items()}
+        made.append(replace(clip, curves=curves, shapes=shapes, about={"plan": pool.names[number]}))
+    return made[0], made[1]
 
 
 def plan_clip(pool: Pool, plan: Plan, scene: int) -> tuple[Clip, tuple[Shape, ...]]:

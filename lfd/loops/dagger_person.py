@@ -34,6 +34,8 @@ class Person:
     device: Device
     view: View | None
     status: Status
+    demonstrates: bool = True
+    """Whether the first round is theirs; else the scripted expert demonstrates."""
 
     def demonstrate(self, recipe: RecordRecipe, out: Path, *, tables: Mapping[str, Any], resume: bool) -> None:
         """The first round: demonstrations until `recipe.episodes` succeeded, those that are there among them.

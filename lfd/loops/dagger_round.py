@@ -97,7 +97,7 @@ class Round:
         begun = read_manifest(recordings) is not None
         if begun and len(numbers_in(recordings, "$")) >= recipe.episodes:
             return
-        if self.person is not None:
+        if self.person is not None and self.person.demonstrates:
             self.person.demonstrate(recipe, recordings, tables=self.recipes.tables, resume=begun)
             return
         record(

@@ -10,7 +10,7 @@ from typing import Any
 
 from lfd.core.artifact import check_output, packed, read_manifest, unpack, write_manifest
 from lfd.core.errors import LfdError, OutputError, RecipeError
-from lfd.core.protocols import Policy, Progress, UnitMap, World, batches, silent
+from lfd.core.protocols import Observers, Policy, Progress, UnitMap, World, batches, silent, unwatched
 from lfd.core.recipe import as_table
 from lfd.experts.noise import NoisyPolicy
 from lfd.experts.registry import check_expert, make_expert
@@ -112,6 +112,7 @@ def record(
     tables: Mapping[str, Any],
     most_worlds: int = EVERY_CORE,
     cluster: UnitMap | None = None,
+    observers: Observers = unwatched,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -120,7 +121,8 @@ def record(
 
     `tables` is the whole recipe file; each recording keeps it, so that `convert` knows what to do with it.
     Worlds run in parallel, one a core, `most_worlds` at the most, or on the machines of a `cluster`; what is
-    recorded does not depend on where, nor on how many.
+    recorded does not depend on where, nor on how many. `observers` gives what else watches an attempt, where it runs
+    in this process.
     Failed attempts are counted and not kept; a recording has the number of its attempt. Episodes that are finished
     stay whatever happens to the rest; with `resume` those in `out` are not recorded again, and the folder ends as if
     it had never been interrupted.
@@ -147,7 +149,7 @@ def record(
     most_attempts = recipe.attempts_per_episode * recipe.episodes
     began, tally = time.perf_counter(), _Tally(recipe.episodes, most_attempts, frozenset(there))
     if cluster is None:
-        ended = _attempt(worlds, recipe, used, tally.next_attempt, out)
+        ended = _attempt(worlds, recipe, used, tally.next_attempt, out, observers)
     else:
         ended = _attempt_on(cluster, robot, recipe, used, tally, out)
     with progress(f"record {recipe.task}", recipe.episodes) as bar:
@@ -208,6 +210,7 @@ def _attempt(
     used: Mapping[str, Any],
     next_attempt: Callable[[], int | None],
     out: Path,
+    observers: Observers = unwatched,
 ) -> Iterator[Outcome]:
     """Make attempts as long as there is a next one; what succeeds is recorded into the folder `out`."""
     policies = [_demonstrator(world, recipe) for world in worlds]
@@ -219,7 +222,8 @@ def _attempt(
         recorder = make_recorder(
             out, used, policy=policies[0].name, seed=recipe.seed, attempt=attempt, keep_failures=False
         )
-        return Start(index=attempt, rng=episode_rng(STAGE, recipe.seed, attempt), observers=[recorder])
+        rng = episode_rng(STAGE, recipe.seed, attempt)
+        return Start(index=attempt, rng=rng, observers=[recorder, *observers(attempt)])
 
     ended = rollouts(worlds, OneEach(policies), next_start, horizon=recipe.horizon, hold_steps=recipe.hold_steps)
     for _, outcome in ended:

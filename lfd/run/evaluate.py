@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from lfd.core.artifact import new_folder, packed, sha256, unpack, write_json, write_manifest
-from lfd.core.protocols import Observer, Progress, UnitMap, batches, silent
+from lfd.core.protocols import Observer, Observers, Progress, UnitMap, batches, silent, unwatched
 from lfd.policies.acting import load_policy
 from lfd.record.episode_file import McapRecorder, Origin
 from lfd.record.mcap_file import SUFFIX
@@ -56,6 +56,7 @@ def evaluate(
     dataset: Path | None = None,
     most_worlds: int = EVERY_CORE,
     cluster: UnitMap | None = None,
+    observers: Observers = unwatched,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> Report:
@@ -64,6 +65,7 @@ def evaluate(
     Worlds run in parallel, one a core, `most_worlds` at the most, or on the machines of a `cluster`; the result
     does not depend on where, nor on how many. `robot` is another robot than the policy was trained for, which must be
     `forced`; `dataset` is what a policy that LeRobot trained was trained on, where its folder does not say so.
+    `observers` gives what else watches an episode, where it runs in this process.
 
     Raises `PolicyError` for a policy that cannot be loaded, `OutputError` when `out` exists.
     """
@@ -76,7 +78,7 @@ def evaluate(
             most = min(most_worlds, recipe.episodes)
             worlds = make_worlds(about["task"], trial.robot, about["control_hz"], most=most, progress=progress)
             stepping = time.perf_counter()
-            ended = _run(worlds, trial, range(recipe.episodes), part / "episodes")
+            ended = _run(worlds, trial, range(recipe.episodes), part / "episodes", observers)
         else:
             load_policy(policy)  # a policy that cannot be loaded shows here and not on a worker
             stepping = time.perf_counter()
@@ -98,13 +100,20 @@ def evaluate(
     return report
 
 
-def _run(worlds: Sequence[RobosuiteWorld], trial: Trial, indices: Sequence[int], episodes: Path) -> Iterator[Row]:
+def _run(
+    worlds: Sequence[RobosuiteWorld],
+    trial: Trial,
+    indices: Sequence[int],
+    episodes: Path,
+    observers: Observers = unwatched,
+) -> Iterator[Row]:
     """Run the episodes of some numbers and record them into a folder; a row for each, its index and its outcome."""
 
     def recorders(index: int) -> list[Observer]:
         about, recipe = trial.about, trial.recipe
         origin = Origin(stage=STAGE, policy=about["policy"], seed=recipe.seed, index=index, recipe=trial.used)
-        return [McapRecorder(episodes / f"episode_{index:06d}{SUFFIX}", origin, keep_failures=True)]
+        recorder = McapRecorder(episodes / f"episode_{index:06d}{SUFFIX}", origin, keep_failures=True)
+        return [recorder, *observers(index)]
 
     for index, outcome in trial.run(worlds, STAGE, indices, recorders):
         yield {"index": index, **asdict(outcome)}

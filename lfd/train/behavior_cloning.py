@@ -27,7 +27,7 @@ from lfd.train.checkpoint import CHECKPOINT, load_checkpoint, save_checkpoint, t
 from lfd.train.compatibility import check_policy, check_robot
 from lfd.train.curves import loggers, write_metrics
 from lfd.train.descent import Descent
-from lfd.train.fitting import Course, fit, last_loss
+from lfd.train.fitting import Course, Row, fit, last_loss
 from lfd.train.processes import joined
 from lfd.train.recipe import TrainRecipe
 from lfd.train.training_data import TrainingData
@@ -61,6 +61,7 @@ def train(
     tables: Mapping[str, Any],
     init: Path | None = None,
     judge: Judge | None = None,
+    report: Callable[[Row], None] | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -68,8 +69,8 @@ def train(
     """Train a policy on `dataset` and save it into the folder `out`, complete, as LeRobot does.
 
     Weights begin with those of the policy `init`, or at random. `judge` makes the judgements by rollouts that the
-    recipe may ask for. Checkpoints are kept in `OUT.training` until `out` is there; with `resume` a training goes on
-    from the last one, to the same weights bit for bit (on a CPU).
+    recipe may ask for, `report` gets each row of the curve. Checkpoints are kept in `OUT.training` until `out` is
+    there; with `resume` a training goes on from the last one, to the same weights bit for bit (on a CPU).
 
     Raises `DatasetError` for a dataset that cannot be used or does not fit, `TrainingError` when the loss is not
     finite (the last checkpoint stays), `OutputError` when `out` or an interrupted training exists.
@@ -96,7 +97,7 @@ def train(
             descent = Descent(policy, data.batch, data.train, recipe, episodes=data.episodes, processes=processes)
             identity = {**used, "dataset": parents[str(dataset)]}
             course = load_checkpoint(out, descent, identity) if resume else None
-            course = _fit(descent, course, data, out, identity, write_policy, judge, progress)
+            course = _fit(descent, course, data, out, identity, write_policy, judge, report, progress)
             if processes.is_first:
                 with new_folder(out, overwrite=overwrite) as part:
                     write_policy(part)
@@ -126,6 +127,7 @@ def _fit(
     identity: Mapping[str, Any],
     write_policy: Callable[[Path], None],
     judge: Judge | None,
+    report: Callable[[Row], None] | None,
     progress: Progress,
 ) -> Course:
     """Train to the end, with judgements, checkpoints and logs as the recipe asks for."""
@@ -144,12 +146,18 @@ def _fit(
             save_checkpoint(out, descent, course, identity, write_policy)
 
     with loggers(recipe.loggers if first else (), training_folder(out) / "logs", identity) as log:
+
+        def tell(row: Row) -> None:
+            log(row)
+            if report and first:
+                report(row)
+
         return fit(
             descent,
             course=course,
             judge=score if recipe.judge_every else None,
             save=save,
-            report=log,
+            report=tell,
             progress=progress if first else silent,
         )
 

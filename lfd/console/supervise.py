@@ -1,0 +1,102 @@
+"""Supervise: look after a learner, take over and hand back, retrain. Behind it is `lfd dagger --device` (HG-DAgger)."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import viser.uplot
+from viser import GuiUplotHandle
+
+from lfd.console.folder import recipes
+from lfd.console.html import hint
+from lfd.console.page import Page
+from lfd.core.protocols import Bar
+from lfd.core.recipe import load_toml
+from lfd.experts.keys import Word
+from lfd.loops.dagger import dagger
+from lfd.loops.dagger_person import Person
+from lfd.loops.dagger_recipe import DATA_TABLES, HUMAN, LEARN_TABLES, LoopRecipes
+from lfd.loops.dagger_round import REPORT
+from lfd.worlds.robots import load_teleop
+
+WORDS = (Word.START, Word.TAKE_OVER, Word.HAND_BACK, Word.GRIPPER, Word.SUCCESS, Word.FAILURE, Word.DISCARD, Word.QUIT)
+HELP = """\
+The learner acts. Take over by moving (keys, gamepad, gizmo)
+or with <b>t</b>, hand back with <b>b</b>; what you do becomes its next lesson. <b>Enter</b> starts each rollout."""
+
+
+def add_supervise(page: Page) -> None:
+    """The tab."""
+    gui, learn_in, data_in = page.gui, page.recipes / "policies", page.recipes / "datasets"
+    gui.add_html(hint(HELP))
+    policies, data = recipes(learn_in, "dagger"), recipes(data_in, "record")
+    recipe = gui.add_dropdown("learner", policies)
+    source = gui.add_dropdown("task", data, initial_value="lift_panda" if "lift_panda" in data else data[0])
+    rounds = gui.add_number("rounds", 3, min=2, max=100, step=1)
+    rollouts = gui.add_number("rollouts a round", 5, min=1, max=1000, step=1)
+    demonstrations = gui.add_number("demonstrations at first", 10, min=1, max=1000, step=1)
+    trials = gui.add_number("trials a round", 10, min=1, max=1000, step=1, hint="by which success is measured")
+    steps = gui.add_number("gradient steps", 2000, min=1, max=1_000_000, step=1)
+    mine = gui.add_checkbox("I demonstrate", False, hint="else the scripted expert gives the demonstrations")
+    name = gui.add_text("save as", "supervised")
+    curve = success_plot(page)
+
+    def begin() -> None:
+        out = page.folder.place(name.value)
+        learn = load_toml(learn_in / f"{recipe.value}.toml", LEARN_TABLES)
+        learn["dagger"] |= {
+            "rounds": int(rounds.value),
+            "episodes_per_round": int(rollouts.value),
+            "demonstrations": int(demonstrations.value),
+            "gate": HUMAN,
+        }
+        learn["train"] |= {"steps": int(steps.value)}
+        learn["eval"] |= {"episodes": int(trials.value)}
+        tables = load_toml(data_in / f"{source.value}.toml", DATA_TABLES)
+        used = LoopRecipes.of(learn, tables, f"{recipe.value} and {source.value}:")
+
+        @contextmanager
+        def progress(label: str, total: int) -> Iterator[Bar]:
+            show_rounds(curve, out)
+            with page.progress(label, total) as bar:
+                yield bar
+
+        def job() -> str:
+            page.device.frame = load_teleop(used.record.robot).frame
+            view = page.view(gizmo=True)
+            person = Person(device=page.device, view=view, status=page.tell, demonstrates=mine.value)
+            report = dagger(used, out, person=person, resume=out.is_dir(), progress=progress)
+            show_rounds(curve, out)
+            low, high = report["interval"]
+            return (
+                f"success {report['success_rate']:.0%} ({low:.0%} to {high:.0%}) after {report['labels']} labels; the "
+                f"policy is {out.relative_to(page.folder.path)}/policy"
+            )
+
+        page.start("supervise", job)
+
+    page.button("Begin", begin, color="blue", hint="goes on with the folder if it is there")
+    page.words(*WORDS)
+
+
+def success_plot(page: Page) -> GuiUplotHandle:
+    """An empty plot of success over rounds."""
+    return page.gui.add_uplot(
+        (np.zeros(1), np.zeros(1)),
+        (viser.uplot.Series(label="round"), viser.uplot.Series(label="success", stroke="#2563eb", width=2)),
+        title="success by round",
+        scales={"x": viser.uplot.Scale(time=False), "y": viser.uplot.Scale(range=(0.0, 1.0))},
+        aspect=1.8,
+        visible=False,
+    )
+
+
+def show_rounds(curve: GuiUplotHandle, out: Path) -> None:
+    """Draw what the rounds' reports say."""
+    rows = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(out.glob(f"round_*/{REPORT}"))]
+    shown = [(row["round"], row["success_rate"]) for row in rows if "success_rate" in row]
+    if shown:
+        x, y = np.array(shown, dtype=float).T
+        curve.data, curve.visible = (x, y), True
