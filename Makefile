@@ -29,6 +29,7 @@ results: $(READY)
 	$(BIN)/lfd bench compounding --results docs/results.md
 	$(BIN)/lfd bench dagger --results docs/results.md
 	$(BIN)/lfd bench irl --results docs/results.md
+	$(BIN)/lfd bench replay --results docs/results.md
 	$(BIN)/lfd experts --episodes 50 --results docs/results.md
 
 pictures: $(READY)
@@ -37,10 +38,10 @@ pictures: $(READY)
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# What cameras and pictures need beside Python, on Debian and Ubuntu: EGL with Mesa's CPU renderer, and a software Vulkan
-# driver for Rerun's viewer.
+# What cameras and pictures need beside Python, on Debian and Ubuntu: EGL with Mesa's CPU renderer, a software Vulkan
+# driver for Rerun's viewer, and Chromium for the tests and pictures of pages.
 system:
-	apt-get update -qq && apt-get install -y -qq libegl1 libgl1 libgl1-mesa-dri mesa-vulkan-drivers
+	apt-get update -qq && apt-get install -y -qq libegl1 libgl1 libgl1-mesa-dri mesa-vulkan-drivers chromium
 
 lock: $(READY)
 	$(UV) pip compile --quiet --no-emit-index-url --no-header --python-version 3.12 --extra dev pyproject.toml --output-file requirements.lock

@@ -5,12 +5,13 @@ import http.client
 import json
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin
 
 from lfd.console.channel import MOST_PER_S, REFUSED, InputChannel
 from lfd.console.gate import Gate
@@ -65,7 +66,7 @@ def served(seats: Seats) -> Iterator[int]:
 def page(port: int, cookie: str = TOKEN):
     headers = {"Cookie": f"lfd_console_{port}={cookie}"}
     with connect(
-        f"ws://127.0.0.1:{port}{INPUT}", additional_headers=headers, origin=f"http://127.0.0.1:{port}"
+        f"ws://127.0.0.1:{port}{INPUT}", additional_headers=headers, origin=Origin(f"http://127.0.0.1:{port}")
     ) as connection:
         yield connection
 
@@ -77,28 +78,29 @@ def server() -> Iterator[tuple[int, Seats]]:
         yield port, seats
 
 
-def asked(port: int, path: str, **headers: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request("GET", path, headers=headers)
-    return connection.getresponse()
+def asked(port: int, path: str, **headers: str) -> tuple[int, Mapping[str, str], bytes]:
+    """Status, headers and body."""
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=10)) as connection:
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, dict(answer.getheaders()), answer.read()
 
 
 def test_the_page_comes_with_its_script_to_who_has_the_cookie_and_to_nobody_else(server) -> None:
     port, _ = server
-    assert asked(port, "/").status == 401
-    assert asked(port, "/?token=guess").status == 401
-    answer = asked(port, f"/?token={TOKEN}")
-    assert answer.status == 303
-    cookie = (answer.getheader("Set-Cookie") or "").partition(";")[0]
+    assert asked(port, "/")[0] == 401
+    assert asked(port, "/?token=guess")[0] == 401
+    status, headers, _ = asked(port, f"/?token={TOKEN}")
+    assert status == 303
+    cookie = headers["Set-Cookie"].partition(";")[0]
     for packed in ("", "gzip"):
-        seen = asked(port, "/", Cookie=cookie, **{"Accept-Encoding": packed})
-        assert seen.status == 200
-        assert seen.getheader("X-Frame-Options") == "DENY"
-        body = seen.read()
+        status, headers, body = asked(port, "/", Cookie=cookie, **{"Accept-Encoding": packed})
+        assert status == 200
+        assert headers["X-Frame-Options"] == "DENY"
         text = (gzip.decompress(body) if packed else body).decode()
         assert "data-lfd-seat" in text
         assert "<title>lfd</title>" in text
-    assert asked(port, "/../../etc/passwd", Cookie=cookie).status == 404
+    assert asked(port, "/../../etc/passwd", Cookie=cookie)[0] == 404
 
 
 def test_connections_need_the_cookie_too(server) -> None:
