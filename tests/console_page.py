@@ -1,20 +1,24 @@
 """A console with a real page in headless Chromium."""
 
 import os
+import re
 import shutil
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Locator, Page, sync_playwright
 
 from lfd.console.console import Console, console
+from lfd.console.page import Page as ConsolePage
+from lfd.core.rotations import matrix_from_wxyz
 
 ROOT = Path(__file__).parent.parent
 FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-PATIENCE_MS = 180_000
+PATIENCE_MS = 90_000
 
 
 def chromium() -> str:
@@ -33,7 +37,7 @@ def free_port() -> int:
 
 
 @contextmanager
-def browser_page(width: int = 1280, height: int = 800) -> Iterator[Page]:
+def browser_page(width: int = 960, height: int = 600) -> Iterator[Page]:
     """An empty page."""
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium(), args=list(FLAGS))
@@ -78,9 +82,14 @@ class Driver:
     def fill(self, **values: object) -> None:
         """Fill in the open tab's fields, each by its label with _ for spaces."""
         for label, value in values.items():
-            field = self.page.get_by_label(label.replace("_", " "), exact=True).locator("visible=true")
+            field = self._field(label.replace("_", " "))
             field.fill(str(value))
             field.press("Tab")
+
+    def _field(self, label: str) -> Locator:
+        """The input of the open tab that stands beside a label."""
+        rows = f"xpath=//label[text()='{label}']/ancestor::div[.//input or .//textarea][1]"
+        return self.page.locator(rows).locator("input, textarea").locator("visible=true").first
 
     def press(self, button: str) -> None:
         self.page.get_by_role("button", name=button, exact=True).locator("visible=true").click()
@@ -89,3 +98,44 @@ class Driver:
         self.page.keyboard.down(key)
         self.page.wait_for_timeout(1e3 * seconds)
         self.page.keyboard.up(key)
+
+    def choose(self, label: str, option: str) -> None:
+        """Choose an option of a dropdown."""
+        self._field(label).click()
+        self.page.get_by_role("option", name=option, exact=True).locator("visible=true").click()
+
+    def seat(self) -> str:
+        """What the page says of who drives."""
+        return self.page.inner_text("[data-lfd-seat]")
+
+    def latency_ms(self) -> float:
+        """The median latency that the page shows."""
+        told = self.page.inner_text("[data-lfd-latency]")
+        found = re.search(r"median ([0-9]+) ms", told)
+        assert found is not None, told
+        return float(found[1])
+
+    def drag_gizmo(self, console: ConsolePage, metres: float) -> None:
+        """Drag the gizmo's arrow that lies most along the world's y by a length."""
+        hand = console.device.hand
+        axes = matrix_from_wxyz(hand.wxyz).T
+        axis = max(axes, key=lambda axis: abs(axis[1]))
+        begin = hand.position + 0.17 * axis
+        end = begin + metres * np.sign(axis[1]) * axis
+        self.page.mouse.move(*self._pixel(console, begin))
+        self.page.wait_for_timeout(300)
+        self.page.mouse.down()
+        for share in np.linspace(0.1, 1.0, 10):
+            self.page.mouse.move(*self._pixel(console, begin + share * (end - begin)))
+            self.page.wait_for_timeout(60)
+        self.page.wait_for_timeout(800)
+        self.page.mouse.up()
+
+    def _pixel(self, console: ConsolePage, point: np.ndarray) -> tuple[float, float]:
+        """Where a point of the world is on the page."""
+        (camera,) = (client.camera for client in console.server.get_clients().values())
+        x, y, z = matrix_from_wxyz(camera.wxyz).T @ (point - camera.position)
+        box = self.page.locator("canvas").first.bounding_box()
+        assert box is not None
+        focal = 0.5 * box["height"] / np.tan(0.5 * camera.fov)
+        return box["x"] + 0.5 * box["width"] + focal * x / z, box["y"] + 0.5 * box["height"] + focal * y / z

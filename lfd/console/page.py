@@ -124,9 +124,8 @@ class Page:
         self.server.scene.set_up_direction("+z")
         self.server.initial_camera.fov = 0.75
         self.look(EYE, LOOK_AT)
-        self.gui.configure_theme(
-            control_layout="fixed", control_width="large", show_logo=False, show_share_button=False
-        )
+        self.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.gui.main_panel.dock_right()
 
     def _at_the_top(self) -> None:
         self._status = self.gui.add_html("", order=BAR)
