@@ -29,6 +29,7 @@ NOT_RUN = {
     r"lfd replay (?!.*--(save|verify))": "opens a window; test_replay.py looks at what it would show",
     r"lfd bench": "measures for minutes or hours; test_bench.py and its neighbours run the suites small",
     r"lfd .*--cluster": "needs a cluster; test_cluster.py starts one",
+    r"lfd console": "serves a page until Ctrl-C; test_console_page.py drives it",
     r"lfd convert SOURCE": "says what the arguments are",
     r"lerobot-train": "takes a minute; test_policies_adoption.py runs it",
     r"lerobot-eval": "takes a minute; test_run_lerobot_env.py runs it",

@@ -1,0 +1,92 @@
+"""Makes the pictures of the console in the documentation (`make pictures`): its real page, in Chromium."""
+
+import shutil
+import socket
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from playwright.sync_api import Page, sync_playwright
+
+from lfd.console.console import console
+
+PICTURES = Path("docs/pictures")
+ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WIDTH, HEIGHT = 1200, 750
+LONGEST_MS = 300_000
+
+
+def demonstrate(page: Page) -> None:
+    """The arm is on its way down."""
+    _begin(page, "Demonstrate", "episode 0: waiting")
+    page.keyboard.press("Enter")
+    _wait(page, "episode 0: moving")
+    page.keyboard.down("f")
+    page.wait_for_timeout(4000)
+    page.keyboard.up("f")
+
+
+def correct(page: Page) -> None:
+    """The arm is pushed down."""
+    _begin(page, "Correct", "cup_tilt")
+    page.wait_for_timeout(2500)
+    page.keyboard.down("f")
+    page.wait_for_timeout(1500)
+
+
+def compare(page: Page) -> None:
+    """The first question."""
+    _begin(page, "Compare", "question 1 of")
+    page.wait_for_timeout(6000)
+
+
+SHOWN: dict[str, Callable[[Page], None]] = {
+    "console_demonstrate": demonstrate,
+    "console_correct": correct,
+    "console_compare": compare,
+}
+
+
+def main(names: list[str]) -> None:
+    """Make the pictures of some names, or all."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        sys.exit("the pictures are taken in Chromium: make system")
+    for name in names or SHOWN:
+        with (
+            TemporaryDirectory() as folder,
+            console(Path(folder), port=_free_port()) as running,
+            sync_playwright() as play,
+        ):
+            browser = play.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+            page.set_default_timeout(LONGEST_MS)
+            page.goto(running.url)
+            page.wait_for_function("document.documentElement.dataset.lfdDrives === 'true'")
+            _wait(page, "choose what to do below")
+            page.get_by_text("Software WebGL rendering").locator("xpath=../../..//button").first.click()
+            SHOWN[name](page)
+            running.page.show_latency()
+            page.screenshot(path=PICTURES / f"{name}.png")
+            browser.close()
+
+
+def _begin(page: Page, mode: str, told: str) -> None:
+    page.get_by_role("tab", name=mode).click()
+    page.get_by_role("button", name="Begin", exact=True).locator("visible=true").click()
+    _wait(page, told)
+
+
+def _wait(page: Page, told: str) -> None:
+    page.wait_for_function("told => document.querySelector('[data-lfd-status]').innerText.includes(told)", arg=told)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
