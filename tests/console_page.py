@@ -58,6 +58,7 @@ class Driver:
 
     def __init__(self, page: Page, url: str):
         self.page = page
+        page.set_default_timeout(PATIENCE_MS)
         page.goto(url)
         page.wait_for_selector("[data-lfd-status]")
 

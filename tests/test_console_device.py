@@ -102,6 +102,13 @@ def test_keys_gamepad_and_buttons_are_what_they_are_on_other_devices() -> None:
     assert device.read().words == ()  # held down, not pressed again
 
 
+def test_what_was_pressed_before_is_not_meant_for_what_begins() -> None:
+    device, _ = device_of(Input(1, (), ("n",)))
+    device.say(Word.GRIPPER)
+    device.begin()
+    assert device.read().words == ()
+
+
 @pytest.mark.parametrize(("frame", "away"), [("base", 1.0), ("view", -1.0)])
 def test_a_dragged_gizmo_deflects_along_the_way_to_it(frame: str, away: float) -> None:
     device, _ = device_of(Input(1), frame=frame)

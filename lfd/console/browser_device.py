@@ -87,6 +87,7 @@ class BrowserDevice:
     def begin(self) -> None:
         """Something new begins: nothing is held, dragged or said."""
         self._stopped.clear()
+        self._seats.forget()
         with self._lock:
             self._words, self._down, self._aim, self._push = [], frozenset(), None, np.zeros(3)
 

@@ -119,6 +119,12 @@ class Seats:
             seat.said.clear()
             return seat.input, said
 
+    def forget(self) -> None:
+        """What was pressed before something new began is not meant for it."""
+        with self._lock:
+            for seat in self._seats.values():
+                seat.said.clear()
+
     def _is_there(self, seat: Seat) -> bool:
         return self._clock() - seat.heard <= STALE_S
 

@@ -36,6 +36,7 @@ def add_supervise(page: Page) -> None:
     source = gui.add_dropdown("task", data, initial_value="lift_panda" if "lift_panda" in data else data[0])
     rounds = gui.add_number("rounds", 3, min=2, max=100, step=1)
     rollouts = gui.add_number("rollouts a round", 5, min=1, max=1000, step=1)
+    seconds = gui.add_number("longest [s]", 20.0, min=1.0, max=600.0, step=1.0, hint="of a rollout")
     demonstrations = gui.add_number("demonstrations at first", 10, min=1, max=1000, step=1)
     trials = gui.add_number("trials a round", 10, min=1, max=1000, step=1, hint="by which success is measured")
     steps = gui.add_number("gradient steps", 2000, min=1, max=1_000_000, step=1)
@@ -49,6 +50,7 @@ def add_supervise(page: Page) -> None:
         learn["dagger"] |= {
             "rounds": int(rounds.value),
             "episodes_per_round": int(rollouts.value),
+            "rollout_seconds": float(seconds.value),
             "demonstrations": int(demonstrations.value),
             "gate": HUMAN,
         }
