@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Locator, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserType, Locator, Page, sync_playwright
 
 from lfd.console.console import Console, console
 from lfd.console.page import Page as ConsolePage
@@ -36,11 +36,16 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
+def launched(kind: BrowserType) -> Browser:
+    """A browser of its own: of two pages of one browser, one would be behind the other and not be drawn."""
+    return kind.launch(executable_path=chromium(), args=list(FLAGS))
+
+
 @contextmanager
 def browser_page(width: int = 960, height: int = 600) -> Iterator[Page]:
     """An empty page."""
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium(), args=list(FLAGS))
+        browser = launched(playwright.chromium)
         page = browser.new_page(viewport={"width": width, "height": height})
         page.set_default_timeout(PATIENCE_MS)
         yield page
