@@ -46,14 +46,13 @@ SMALLER = {
     "eval": {"--episodes": "2"},
     "dagger": {"--rounds": "2"},
     "plan": {"--demonstrations": "2"},
-    "compare": {"--questions": "2", "--plans": "8"},
+    "compare": {"--questions": "6", "--plans": "20"},
     "correct": {"--runs": "1"},
     "interact": {"--episodes": "1"},
 }
 """What commands are given in tests, in place of what their pages say; one more with --resume."""
 SMALLER_IF_GIVEN = {"replay": {"--episode": "0"}, "irl": {"--holdout": "1"}}
 SET = {
-    "sweep": ["train.steps=20", "eval.episodes=1"],
     "dagger": [
         "train.steps=20",
         "dagger.demonstrations=2",
@@ -64,6 +63,7 @@ SET = {
     ],
 }
 """Keys of recipes that tests make smaller."""
+VARIED = {"sweep": ("--vary", "train.steps=[20]", "--vary", "eval.episodes=[1]")}
 IN_PLACE = ("recover", "undo", "--resume", "--append")
 """Words of commands that change what is there."""
 
@@ -133,6 +133,7 @@ def smaller(command: str) -> list[str]:
             arguments += [option, str(int(value) + more)]
     for assignment in SET.get(name, ()):
         arguments += ["--set", assignment]
+    arguments += VARIED.get(name, ())
     return [name, *arguments]
 
 
@@ -167,7 +168,9 @@ def _command(command: str, origin: dict[str, tuple], cache: Cache) -> None:
     from lfd.cli import main
 
     if not command.startswith("lfd "):
-        subprocess.run(shlex.split(command), check=True)
+        name, *arguments = shlex.split(command)
+        beside = Path(sys.executable).parent / name  # the environment that the tests run in may not be the shell's
+        subprocess.run([str(beside) if beside.is_file() else name, *arguments], check=True)
         return
     arguments = smaller(command)
     before = {word: made for word in arguments for name, made in origin.items() if _is_in(word, name)}
