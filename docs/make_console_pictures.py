@@ -1,7 +1,6 @@
 """Makes the pictures of the console in the documentation (`make pictures`): its real page, in Chromium."""
 
 import shutil
-import socket
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +9,7 @@ from tempfile import TemporaryDirectory
 from playwright.sync_api import Page, sync_playwright
 
 from lfd.console.console import console
+from lfd.console.serving import free_port
 
 PICTURES = Path("docs/pictures")
 ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -56,7 +56,7 @@ def main(names: list[str]) -> None:
     for name in names or SHOWN:
         with (
             TemporaryDirectory() as folder,
-            console(Path(folder), port=_free_port()) as running,
+            console(Path(folder), port=free_port()) as running,
             sync_playwright() as play,
         ):
             browser = play.chromium.launch(executable_path=chromium, args=ARGUMENTS)
@@ -80,12 +80,6 @@ def _begin(page: Page, mode: str, told: str) -> None:
 
 def _wait(page: Page, told: str) -> None:
     page.wait_for_function("told => document.querySelector('[data-lfd-status]').innerText.includes(told)", arg=told)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from playwright.sync_api import Browser, BrowserType, Locator, Page, sync_playwr
 
 from lfd.console.console import Console, console
 from lfd.console.page import Page as ConsolePage
+from lfd.console.serving import free_port
 from lfd.core.rotations import matrix_from_wxyz
 
 ROOT = Path(__file__).parent.parent
@@ -28,12 +28,6 @@ def chromium() -> str:
         pytest.skip("no Chromium here: `make system` installs it")
     assert found is not None, "CI has no Chromium: .ci/run calls `make system`"
     return found
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def launched(kind: BrowserType) -> Browser:

@@ -16,9 +16,8 @@ from websockets.typing import Origin
 from lfd.console.channel import MOST_PER_S, REFUSED, InputChannel
 from lfd.console.gate import Gate
 from lfd.console.seats import Seats
-from lfd.console.serving import INPUT, page_server
+from lfd.console.serving import INPUT, free_port, page_server
 from lfd.core.errors import InputError
-from tests.console_page import free_port
 
 TOKEN = "a-token-of-this-test"
 

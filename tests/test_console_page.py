@@ -2,6 +2,8 @@
 
 import json
 import statistics
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -210,3 +212,19 @@ def test_the_latency_is_shown_on_the_page(console, driver) -> None:
     console.page.show_latency()
     driver.page.wait_for_function("document.querySelector('[data-lfd-latency]').innerText.includes('median')")
     assert driver.latency_ms() == pytest.approx(statistics.median(late), abs=0.6)
+
+
+def test_a_person_pushes_in_a_page_of_the_command_line(driver, tmp_path) -> None:
+    command = [sys.executable, "-m", "lfd.cli", "correct", "table", "--person", "console", "--runs", "1"]
+    with subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        told = next(line for line in process.stderr if "push the arm at" in line)
+        Driver(driver.page, told.split()[-1])
+        driver.wait_for("table_distance")
+        driver.page.wait_for_timeout(2500)
+        driver.hold("f", 1.2)
+        process.stderr.read()
+    assert process.returncode == 0
+    episode = read_episode(tmp_path / "out" / "recordings" / "episode_000000.mcap")
+    assert episode.signals["push"].values[:, 2].min() < -5.0
+    assert len(load_reward(tmp_path / "out" / "reward").history) >= 1

@@ -3,6 +3,7 @@
 It imports its stage when it runs, so that `lfd --help` answers at once.
 """
 
+import sys
 from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -17,7 +18,7 @@ CORRECTION_TASKS = ("cup", "table", "laptop", "person")
 """Names of `lfd.loops.correction_tasks`, which is imported when the command runs."""
 CORRECTION_RULES = ("one", "all", "confident")
 RESPONSES = ("learn", "deform", "impedance")
-SCRIPTED, DEVICE = "scripted", "device"
+SCRIPTED, DEVICE, CONSOLE = "scripted", "device", "console"
 DEMONSTRATIONS = 10
 
 
@@ -40,9 +41,9 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     made.add_argument("--robot", default="panda", metavar="NAME", help="robot config (default: panda)")
     made.add_argument(
-        "--person", default=SCRIPTED, metavar="scripted|device|FILE",
-        help="who pushes: somebody scripted, who has weights of their own (default); you, with --device; the pushes of "
-        "a recording, again",
+        "--person", default=SCRIPTED, metavar="scripted|device|console|FILE",
+        help="who pushes: somebody scripted, who has weights of their own (default); you, with --device, or in a page "
+        "of the browser by dragging the arm; the pushes of a recording, again",
     )  # fmt: skip
     made.add_argument(
         "--device", default="keyboard", metavar="DEVICE",
@@ -146,6 +147,16 @@ def _person(given: Namespace, recipe: Any, setup: Any) -> Iterator[Any]:
                 observers=lambda: [Watching(view, status)],
                 around=lambda policy: Paced(policy, recipe.control_hz),
             )
+    elif given.person == CONSOLE:
+        from lfd.console.console import console
+        from lfd.console.correct import add_pushing, seat_at
+        from lfd.console.serving import free_port
+
+        with console(given.out.parent, port=free_port(), modes={}) as running:
+            plot = add_pushing(running.page, recipe.task)
+            print(f"push the arm at {running.url}", file=sys.stderr, flush=True)
+            with seat_at(running.page, plot, recipe, setup) as seat:
+                yield seat
     else:
         yield Seat(recorded_person(Path(given.person)))
 

@@ -98,7 +98,7 @@ class BrowserDevice:
     def check(self) -> None:
         """Raise `Stopped` when what is going on is to end."""
         if self._stopped.is_set():
-            raise Stopped("stopped; what was finished is kept")
+            raise Stopped("stopped in the page")
 
     def read(self) -> DeviceState:
         """The present state; waits while no driver is there. Raises `Stopped`."""

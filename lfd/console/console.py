@@ -1,6 +1,6 @@
 """The console: the page of `lfd console`, from its server to its modes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,17 +48,23 @@ class Console:
 
 @contextmanager
 def console(
-    folder: Path, *, recipes: Path = Path(), address: str = LOOPBACK, port: int = PORT, token: str | None = None
+    folder: Path,
+    *,
+    recipes: Path = Path(),
+    address: str = LOOPBACK,
+    port: int = PORT,
+    modes: Mapping[str, Callable[[Page], None]] = MODES,
 ) -> Iterator[Console]:
     """A page that works in `folder`, with the recipes below `recipes`, until the block ends.
 
-    `token` is drawn anew unless given. Raises `InputError` when there are no recipes, or the port cannot be had.
+    Without `modes` it is for whoever calls, and shows nothing by itself. Raises `InputError` when there are no recipes
+    for the modes, or the port cannot be had.
     """
-    for name in ("datasets", "policies"):
+    for name in ("datasets", "policies") if modes else ():
         if not (recipes / name).is_dir():
             raise InputError(f"no folder {recipes / name}: the console offers its recipes; start it where they are")
     folder.mkdir(parents=True, exist_ok=True)
-    token = token or token_urlsafe(24)
+    token = token_urlsafe(24)
     seats = Seats()
     clients = Clients(seats)
     channel = InputChannel(seats, clients.seated)
@@ -71,11 +77,12 @@ def console(
         # viser lets any page ask for an address on a server of the internet
         server._websock_server._incoming_handlers.pop(viser._messages.ShareUrlRequest, None)
         page = Page(server, clients, device, Folder(folder), recipes)
-        tabs = page.gui.add_tab_group(order=TABS)
-        for name, add in MODES.items():
-            with tabs.add_tab(name):
-                add(page)
-        page.start("welcome", lambda: _show_arm(page))
+        if modes:
+            tabs = page.gui.add_tab_group(order=TABS)
+            for name, add in modes.items():
+                with tabs.add_tab(name):
+                    add(page)
+            page.start("welcome", lambda: _show_arm(page))
         host = f"[{address}]" if ":" in address else address
         try:
             yield Console(f"http://{host}:{port}/?token={token}", page)

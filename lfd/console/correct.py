@@ -1,6 +1,8 @@
 """Correct: push the arm by dragging it while it carries out its plan. Behind it is `lfd correct --person device`."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import trimesh
@@ -14,7 +16,7 @@ from lfd.console.viser_scene import ViserScene
 from lfd.core.artifact import sha256
 from lfd.core.protocols import Observation, Observer, Transition, World
 from lfd.experts.pushing import DevicePerson
-from lfd.loops.correcting import CorrectionRecipe, learner_of, set_up, start_reward
+from lfd.loops.correcting import CorrectionRecipe, Setup, learner_of, set_up, start_reward
 from lfd.loops.correction_results import Watching
 from lfd.loops.correction_session import Seat, correct_into
 from lfd.loops.correction_tasks import FEATURES, TASKS
@@ -65,22 +67,8 @@ def add_correct(page: Page) -> None:
         learner_of(reward, recipe)
 
         def job() -> str:
-            frame, limit = load_teleop(recipe.robot).frame, load_model(recipe.robot).push_n
-            page.device.frame = frame
             setup = set_up(recipe)
-            view = page.view(gizmo=False)
-            show_shapes(page.scene, setup.planner.scene.shapes)
-
-            def observers() -> list[Observer]:
-                return [page.device.hand, Watching(view, page.tell), CorrectionView(page.scene, plot)]
-
-            seat = Seat(
-                DevicePerson(page.device, frame, limit),
-                observers=observers,
-                around=lambda policy: Paced(policy, recipe.control_hz),
-            )
-            page.scene.on_drag(lambda event: _drag(page, event))
-            try:
+            with seat_at(page, plot, recipe, setup) as seat:
                 report, learned = correct_into(
                     out,
                     recipe,
@@ -90,9 +78,6 @@ def add_correct(page: Page) -> None:
                     parents={} if old is None else {str(old): sha256(old)},
                     progress=page.progress,
                 )
-            finally:
-                page.scene.on_drag(None)
-                page.scene.erase()
             moved = ", ".join(f"{n} {w:.2f}" for n, w in zip(learned.features, learned.weights, strict=True))
             place = (out / "reward").relative_to(page.folder.path)
             return f"{report['pushes']} pushes noticed; weights: {moved}; the reward is {place}"
@@ -102,6 +87,36 @@ def add_correct(page: Page) -> None:
     page.button("Begin", begin, color="blue")
     page.button("Look for rewards", refresh, hint="lists the rewards that are in the folder by now")
     refresh()
+
+
+@contextmanager
+def seat_at(page: Page, plot: GuiUplotHandle, recipe: CorrectionRecipe, setup: Setup) -> Iterator[Seat]:
+    """Whoever drives the page pushes; what they see are the arm, forces, paths and weights."""
+    frame, limit = load_teleop(recipe.robot).frame, load_model(recipe.robot).push_n
+    page.device.frame = frame
+    view = page.view(gizmo=False)
+    show_shapes(page.scene, setup.planner.scene.shapes)
+    page.scene.on_drag(lambda event: _drag(page, event))
+
+    def observers() -> list[Observer]:
+        return [page.device.hand, Watching(view, page.tell), CorrectionView(page.scene, plot)]
+
+    try:
+        yield Seat(
+            DevicePerson(page.device, frame, limit),
+            observers=observers,
+            around=lambda policy: Paced(policy, recipe.control_hz),
+        )
+    finally:
+        page.scene.on_drag(None)
+        page.scene.erase()
+
+
+def add_pushing(page: Page, task: str) -> GuiUplotHandle:
+    """What a page needs whose one purpose is a correction; returns its plot of the weights."""
+    page.gui.add_html(hint(HELP))
+    page.gui.add_html(_told(task))
+    return weights_plot(page)
 
 
 def _told(task: str) -> str:

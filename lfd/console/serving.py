@@ -52,6 +52,13 @@ def page_server(address: str, port: int, gate: Gate, channel: Serve) -> Iterator
         server.stop()
 
 
+def free_port() -> int:
+    """A port of the loopback that nobody has at the moment."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return probe.getsockname()[1]
+
+
 def check_port(address: str, port: int) -> None:
     """Raise `InputError` for a port that is in use, or an address that is not this machine's."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET

@@ -82,7 +82,9 @@ class Nobody:
 def recorded_person(path: Path) -> RecordedPerson:
     """Whoever pushed in a recording. Raises `InputError` for one in which nobody could, and what reading it raises."""
     if not path.is_file():
-        raise InputError(f"no recording {path}: --person takes scripted, device, or a recording of `lfd correct`")
+        raise InputError(
+            f"no recording {path}: --person takes scripted, device, console, or a recording of `lfd correct`"
+        )
     signal = read_episode(path).signals.get("push")
     if signal is None or signal.names != NAMES:
         raise InputError(f"nobody pushes in {path}; `lfd correct TASK --out DIR` records pushes")
