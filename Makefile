@@ -7,8 +7,10 @@ READY := .venv/ready
 demo: $(READY)
 	$(BIN)/lfd demo --out outputs/demo --overwrite
 
+# The tests of a file stay together, and share what is slow to build. With more cores: make test WORKERS=8
+WORKERS := 2
 test: lint type
-	$(BIN)/pytest
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n $(WORKERS) --dist loadfile
 
 lint: $(READY)
 	$(BIN)/ruff format --check && $(BIN)/ruff check && $(BIN)/lint-imports

@@ -90,6 +90,7 @@ def test_a_dropped_connection_stops_the_arm_and_a_reloaded_page_goes_on(console,
     driver.page.wait_for_timeout(500)
     hand = console.page.device.hand
     driver.page.goto("about:blank")  # the page is gone with its key down
+    driver.page.keyboard.up("r")
     driver.page.wait_for_timeout(200)
     stood = hand.position.copy()
     driver.page.wait_for_timeout(1000)

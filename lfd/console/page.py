@@ -169,8 +169,10 @@ class Page:
         self.clients.left(client.client_id)
 
     def _show_drivers(self) -> None:
-        for show in list(self._lines.values()):
-            show()
+        there = self.server.get_clients()
+        for client, show in list(self._lines.items()):
+            if client in there:  # its own farewell may come later
+                show()
 
 
 class _Bar:
