@@ -60,6 +60,7 @@ class Driver:
         page.set_default_timeout(PATIENCE_MS)
         page.goto(url)
         page.wait_for_selector("[data-lfd-status]")
+        page.get_by_text("Software WebGL rendering").locator("xpath=../../..//button").first.click()  # it hides the arm
 
     def told(self) -> str:
         """What the page says of what goes on."""
@@ -123,11 +124,18 @@ class Driver:
         axes = matrix_from_wxyz(hand.wxyz).T
         axis = max(axes, key=lambda axis: abs(axis[1]))
         begin = hand.position + 0.17 * axis
-        end = begin + metres * np.sign(axis[1]) * axis
+        self._drag(console, begin, begin + metres * np.sign(axis[1]) * axis, moves=10)
+
+    def drag_arm(self, console: ConsolePage, way: tuple[float, float, float]) -> None:
+        """Drag the shoulder, which hardly moves by itself, by a way [m]."""
+        begin = np.array(console.scene._bodies["robot0_link2"].position)
+        self._drag(console, begin, begin + np.array(way), moves=3)
+
+    def _drag(self, console: ConsolePage, begin: np.ndarray, end: np.ndarray, moves: int) -> None:
         self.page.mouse.move(*self._pixel(console, begin))
         self.page.wait_for_timeout(300)
         self.page.mouse.down()
-        for share in np.linspace(0.1, 1.0, 10):
+        for share in np.arange(1, moves + 1) / moves:
             self.page.mouse.move(*self._pixel(console, begin + share * (end - begin)))
             self.page.wait_for_timeout(60)
         self.page.wait_for_timeout(800)

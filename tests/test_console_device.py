@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lfd.console.browser_device import AIM_M, BrowserDevice, Stopped, rotation_vector
+from lfd.console.browser_device import AIM_M, PULL_M, BrowserDevice, Stopped, rotation_vector
 from lfd.console.folder import Folder
 from lfd.console.messages import Input, Pad
 from lfd.console.seats import STALE_S, Seats
@@ -124,10 +124,16 @@ def test_a_dragged_gizmo_deflects_along_the_way_to_it(frame: str, away: float) -
     assert not device.read().translation.any()
 
 
-def test_a_push_deflects_along_the_drag() -> None:
+def test_what_is_pulled_comes_nearer_to_the_pointer() -> None:
     device, _ = device_of(Input(1), frame="view")
-    device.push(np.array([0.0, 0.3, 0.4]))
+    grabbed = np.array([0.0, 0.0, 0.1])
+    to = grabbed + PULL_M * np.array([0.0, 0.3, 0.4])
+    device.pull(grabbed, to)
     assert device.read().translation == pytest.approx([0.0, -0.3, 0.4])
+    device.hand.position = PULL_M * np.array([0.0, 0.3, 0.2])  # the arm has moved, and the pointer has not
+    assert device.read().translation == pytest.approx([0.0, 0.0, 0.2])
+    device.let_go()
+    assert not device.read().translation.any()
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 3.0])

@@ -200,7 +200,7 @@ def test_a_failed_round_changes_nothing(recorded, tmp_path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "dataset"]
 
 
-@pytest.mark.parametrize("process", [os.getpid(), 2**22 + 1])
+@pytest.mark.parametrize("process", [os.getpid(), 2**22 + 1], ids=["ours", "nobody"])
 def test_a_run_killed_between_the_two_renames_is_undone(process, recorded, tmp_path) -> None:
     """The numbers are those of a dead process, and of this one: in a container they repeat."""
     write_all(tmp_path / "a", part(recorded, 0, 5))

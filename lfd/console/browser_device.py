@@ -40,6 +40,8 @@ BUTTONS: Mapping[int, tuple[Word, ...]] = {
 """Number of a button to its words."""
 AIM_M, AIM_RAD = 0.06, 0.4
 """Distance and angle to a dragged gizmo from which on the hand moves as fast as it may."""
+PULL_M = 0.2
+"""Distance from what was grabbed of the arm to the pointer from which on it is pulled with all that is possible [m]."""
 POLL_S = 0.01
 
 
@@ -58,7 +60,7 @@ class BrowserDevice:
         self._words: list[Word] = []
         self._down: frozenset[int] = frozenset()
         self._aim: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]] | None = None
-        self._push = np.zeros(3)
+        self._pull: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None
         self._stopped = threading.Event()
         self.frame = "base"
         self.hand = Hand()
@@ -79,17 +81,26 @@ class BrowserDevice:
             still = np.array([1.0, 0.0, 0.0, 0.0]) if wxyz is None else wxyz
             self._aim = None if position is None else (position, still)
 
-    def push(self, share: Float[np.ndarray, "3"]) -> None:
-        """Deflect along a direction of the world frame, by a share of all that is possible."""
+    def pull(self, grabbed: Float[np.ndarray, "3"], to: Float[np.ndarray, "3"]) -> None:
+        """Pull what was grabbed of the arm, now at a point of the world frame, towards another one [m], until let go.
+
+        Like a spring: less as the arm comes nearer.
+        """
         with self._lock:
-            self._push = share
+            offset = grabbed - self.hand.position if self._pull is None else self._pull[0]
+            self._pull = offset, to
+
+    def let_go(self) -> None:
+        """Nothing is pulled any more."""
+        with self._lock:
+            self._pull = None
 
     def begin(self) -> None:
         """Something new begins: nothing is held, dragged or said."""
         self._stopped.clear()
         self._seats.forget()
         with self._lock:
-            self._words, self._down, self._aim, self._push = [], frozenset(), None, np.zeros(3)
+            self._words, self._down, self._aim, self._pull = [], frozenset(), None, None
 
     def stop(self) -> None:
         """End what is going on, at its next reading."""
@@ -108,7 +119,7 @@ class BrowserDevice:
             if heard is not None:
                 break
             with self._lock:  # what is dragged is let go
-                self._aim, self._push = None, np.zeros(3)
+                self._aim, self._pull = None, None
             time.sleep(POLL_S)
         given, said = heard
         with self._lock:
@@ -122,9 +133,12 @@ class BrowserDevice:
         return pushed([*_pushes(given), *dragged], words)
 
     def _dragged(self) -> Iterator[tuple[str, float]]:
-        """What the gizmo or a push says, in the directions of the device."""
+        """What the gizmo or a pull says, in the directions of the device."""
         turn = base_from_device(self.frame, self.hand.wxyz)
-        way, rotation = self._push, np.zeros(3)
+        way, rotation = np.zeros(3), np.zeros(3)
+        if self._pull is not None:
+            offset, to = self._pull
+            way = (to - self.hand.position - offset) / PULL_M
         if self._aim is not None:
             position, wxyz = self._aim
             way = way + (position - self.hand.position) / AIM_M

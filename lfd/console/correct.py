@@ -25,8 +25,6 @@ from lfd.record.pacing import Paced
 from lfd.rewards.reward_artifact import load_reward
 from lfd.worlds.robots import load_model, load_teleop
 
-FULL_M = 0.2
-"""Length of a drag that pushes with all that the robot may be pushed with [m]."""
 SHOWN_S = 0.05
 """Time between arrows, and control steps' pictures [s]."""
 PLOTTED_S = 0.25
@@ -124,11 +122,13 @@ def _told(task: str) -> str:
 
 
 def _drag(page: Page, event: viser.SceneNodeDragEvent) -> None:
-    """A drag of the arm: its length says how hard."""
+    """A drag of the arm: it is pulled towards the pointer."""
     if not page.clients.drives(event.client_id):
         return
-    away = np.array(event.end_position) - np.array(event.start_position)
-    page.device.push(np.zeros(3) if event.phase == "end" else away / FULL_M)
+    if event.phase == "end":
+        page.device.let_go()
+    else:
+        page.device.pull(np.array(event.start_position), np.array(event.end_position))
 
 
 class CorrectionView:
