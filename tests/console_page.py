@@ -129,7 +129,7 @@ class Driver:
     def drag_arm(self, console: ConsolePage, way: tuple[float, float, float]) -> None:
         """Drag the shoulder, which hardly moves by itself, by a way [m]."""
         begin = np.array(console.scene._bodies["robot0_link2"].position)
-        self._drag(console, begin, begin + np.array(way), moves=3)
+        self._drag(console, begin, begin + np.array(way), moves=2)
 
     def _drag(self, console: ConsolePage, begin: np.ndarray, end: np.ndarray, moves: int) -> None:
         self.page.mouse.move(*self._pixel(console, begin))
