@@ -5,20 +5,15 @@ Times are of the processor, so that they hold on a machine that is busy. What it
 same worlds with and without, in turn, with somebody who receives all that is sent; the server's time counts too.
 """
 
-import os
-import signal
-import subprocess
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from lfd.core.protocols import Observer, Observers, Progress, silent, unwatched
-from lfd.experts.playback import PlaybackPolicy
+from lfd.bench.live import CONTROL_HZ, SECONDS, bench_live, record_random
+from lfd.core.protocols import Progress, silent
 from lfd.interaction.driving_robots import DriverOptions
 from lfd.loops.correcting import (
     CorrectionRecipe,
@@ -32,20 +27,12 @@ from lfd.loops.correcting import (
 from lfd.loops.interacting import InteractRecipe, run_trial
 from lfd.loops.replaying import scene_shapes
 from lfd.record.episode_file import McapRecorder, Origin
-from lfd.record.pacing import Paced
 from lfd.replay import shown_mesh
 from lfd.replay.clip import Clip, kept_model, recording_clip
-from lfd.replay.live_worlds import RATE, LiveWorlds
-from lfd.replay.rerun_live import RerunBoard, serving
 from lfd.replay.rerun_scene import replay
-from lfd.replay.viewer_process import HOST, program
 from lfd.worlds.robosuite_world import RobosuiteWorld, make_world
-from lfd.worlds.rollout import episode_rng, rollout
 
-CONTROL_HZ, SECONDS = 20, 10.0
 CAMERAS, SIDE = ("agentview", "robot0_eye_in_hand"), 128
-SERVER = "--serve-web"
-"""By which the server is found among the processes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,9 +52,20 @@ class ReplayBench:
 
 
 def bench_replay(
-    *, task: str, robot: str, repeats: int, pairs: int, every_kind: bool, seed: int, progress: Progress = silent
+    *,
+    task: str,
+    robot: str,
+    repeats: int,
+    pairs: int,
+    episodes: int,
+    gradient_steps: int,
+    every_kind: bool,
+    seed: int,
+    progress: Progress = silent,
 ) -> ReplayBench:
     """Measure files over `repeats`, being watched over `pairs` of runs; corrections and cameras with `every_kind`.
+
+    `episodes` and `gradient_steps` are those of an evaluation and a training that are watched.
 
     Raises `UnknownName` for a task or robot that lfd does not know.
     """
@@ -85,7 +83,7 @@ def bench_replay(
         clip = recording_clip(made[first])
         megabytes["of these, meshes and layout"] = _size(_still(clip), folder / "out.rrd")
         bar.advance(note=f"{real_time[first]:.0f}x real time")
-        live = _live(world, folder, pairs, seed)
+        live = bench_live(world, folder, pairs=pairs, episodes=episodes, gradient_steps=gradient_steps, seed=seed)
         bar.advance()
     return ReplayBench(task=task, robot=robot, real_time=real_time, once=once, megabytes=megabytes, live=live)
 
@@ -94,7 +92,7 @@ def _recordings(world: RobosuiteWorld, folder: Path, *, every_kind: bool, seed: 
     """A recording of each kind."""
     spec = world.spec
     made = {f"{spec.task}, {SECONDS:g} s at {CONTROL_HZ} Hz": folder / "plain.mcap"}
-    _record(world, folder / "plain.mcap", seed)
+    record_random(world, folder / "plain.mcap", seed)
     recipe = InteractRecipe(
         scene="merge",
         robots=(DriverOptions(kind="active", assumed="aggressive"),),
@@ -109,7 +107,7 @@ def _recordings(world: RobosuiteWorld, folder: Path, *, every_kind: bool, seed: 
         return made
     filmed = make_world(spec.task, spec.robot, CONTROL_HZ)
     filmed.take_cameras(CAMERAS, height=SIDE, width=SIDE)
-    _record(filmed, folder / "filmed.mcap", seed)
+    record_random(filmed, folder / "filmed.mcap", seed)
     made[f"the same with {len(CAMERAS)} cameras of {SIDE} x {SIDE}"] = folder / "filmed.mcap"
     pushed = CorrectionRecipe(task="laptop", robot=spec.robot, runs=1, seed=seed)
     setup = set_up(pushed)
@@ -119,21 +117,6 @@ def _recordings(world: RobosuiteWorld, folder: Path, *, every_kind: bool, seed: 
         (folder / "corrected").glob("*.mcap")
     )
     return made
-
-
-def _record(
-    world: RobosuiteWorld, path: Path, seed: int, watching: Sequence[Observer] = (), *, paced: bool = False
-) -> None:
-    """An episode of small random actions, as fast as it goes or in real time."""
-    steps, size = round(SECONDS * CONTROL_HZ), len(world.spec.action_low)
-    actions = np.random.default_rng(seed).uniform(-0.3, 0.3, (steps, size))
-    origin = Origin(stage="record", policy="bench", seed=seed, index=0, recipe={})
-    observers = [McapRecorder(path, origin, keep_failures=True), *watching]
-    start = episode_rng("record", seed, 0)
-    policy = PlaybackPolicy(actions)
-    rollout(
-        world, Paced(policy, CONTROL_HZ) if paced else policy, observers, start, horizon=steps, hold_steps=steps + 1
-    )
 
 
 def _once(path: Path) -> dict[str, float]:
@@ -175,58 +158,3 @@ def _still(clip: Clip) -> Clip:
 def _size(clip: Clip, out: Path) -> float:
     replay(clip, save=out, overwrite=True)
     return round(out.stat().st_size / 1e6, 2)
-
-
-def _live(world: RobosuiteWorld, folder: Path, pairs: int, seed: int) -> dict[str, float]:
-    """What it costs to be watched, in turn with and without.
-
-    Drawing takes the same time of a core however fast the world is, so it is measured on a world that runs in real
-    time and has little else to do; at full speed the rest shows, keeping states, in what else is noise.
-    """
-    with serving() as (_, source), _reader(source, folder / "read.rrd"):
-        board = LiveWorlds(RerunBoard(source, "bench", [RATE], scenes=1))
-
-        def run(observers: Observers, *, paced: bool, times: int = 1) -> tuple[float, float]:
-            began, wall = _spent(), time.perf_counter()
-            for _ in range(times):
-                _record(world, folder / "live.mcap", seed, observers(0), paced=paced)
-            return _spent() - began, time.perf_counter() - wall
-
-        first, _ = run(board.observers, paced=False)  # loads the model and sends its shapes
-        second, _ = run(unwatched, paced=False)
-        of_a_core, ratios = [], []
-        for _ in range(pairs):
-            (seen, wall), (alone, _) = (run(watching, paced=True) for watching in (board.observers, unwatched))
-            of_a_core.append((seen - alone) / wall)
-            (seen, _), (alone, _) = (run(w, paced=False, times=5) for w in (board.observers, unwatched))
-            ratios.append(seen / alone)
-        board.close()
-    return {
-        "share of a core for a world that is watched": round(float(np.median(of_a_core)), 4),
-        "processor time of recording at full speed, watched to not": round(float(np.median(ratios)), 3),
-        "to begin [s]": round(max(0.0, first - second), 2),
-    }
-
-
-@contextmanager
-def _reader(source: str, path: Path) -> Iterator[None]:
-    """Somebody who receives all that is sent to a viewer, as a browser does."""
-    command = [program(), "--connect", source, "--save", str(path), "--bind", HOST, "--port", "auto"]
-    reader = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-    try:
-        yield
-    finally:
-        os.killpg(reader.pid, signal.SIGTERM)  # the command is a wrapper around the program
-        reader.wait()
-
-
-def _spent() -> float:
-    """Processor time of this process, and on Linux of the viewer's server that it has started [s]."""
-    ticks = 0
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            if SERVER.encode() in stat.with_name("cmdline").read_bytes().split(b"\0"):
-                ticks += sum(map(int, stat.read_text().rpartition(")")[2].split()[11:13]))
-        except FileNotFoundError:  # it has just ended
-            continue
-    return time.process_time() + ticks / 100

@@ -243,6 +243,8 @@ def _replay(given: Namespace) -> tuple[Measured, Measured]:
             robot=given.robot,
             repeats=3 if given.quick else 20,
             pairs=2 if given.quick else 10,
+            episodes=4 if given.quick else 20,
+            gradient_steps=100 if given.quick else 2000,
             every_kind=not given.quick,
             seed=given.seed,
             progress=progress_bar,

@@ -12,6 +12,7 @@ from viser import GuiUplotHandle
 from lfd.console.folder import recipes
 from lfd.console.html import hint
 from lfd.console.page import Page
+from lfd.core.errors import InputError
 from lfd.core.protocols import Bar
 from lfd.core.recipe import load_toml
 from lfd.experts.keys import Word
@@ -19,8 +20,10 @@ from lfd.loops.dagger import dagger
 from lfd.loops.dagger_person import Person
 from lfd.loops.dagger_recipe import DATA_TABLES, HUMAN, LEARN_TABLES, LoopRecipes
 from lfd.loops.dagger_round import REPORT
+from lfd.loops.watching import trial_of, watch
 from lfd.worlds.robots import load_teleop
 
+NONE = "none yet"
 WORDS = (Word.START, Word.TAKE_OVER, Word.HAND_BACK, Word.GRIPPER, Word.SUCCESS, Word.FAILURE, Word.DISCARD, Word.QUIT)
 HELP = """\
 The learner acts. Take over by moving (keys, gamepad, gizmo)
@@ -81,6 +84,43 @@ def add_supervise(page: Page) -> None:
 
     page.button("Begin", begin, color="blue", hint="goes on with the folder if it is there")
     page.words(*WORDS)
+    add_watch(page)
+
+
+def add_watch(page: Page) -> None:
+    """A policy that is there: the same without retraining."""
+    gui = page.gui
+    with gui.add_folder("Or a policy that is there", expand_by_default=False):
+        gui.add_html(hint("Watch it, take over, hand back: what results is recorded, with what you did as labels."))
+        policy = gui.add_dropdown("policy", [NONE])
+        robot = gui.add_text("on robot", "", hint="empty for the one that it was trained for")
+        rollouts = gui.add_number("rollouts", 5, min=1, max=1000, step=1)
+        seconds = gui.add_number("seconds of each", 20.0, min=1.0, max=600.0, step=1.0)
+        name = gui.add_text("recordings", "looked_after")
+
+        def refresh() -> None:
+            policy.options = [one.name for one in page.folder.artifacts("policy")] or [NONE]
+
+        def begin() -> None:
+            if policy.value == NONE:
+                raise InputError("no policy is in the folder: train one, then press Look for policies")
+            out = page.folder.place(name.value)
+            path = page.folder.place(policy.value)
+            trial = trial_of(path, robot.value.strip() or None, longest_s=float(seconds.value))
+
+            def job() -> str:
+                page.device.frame = load_teleop(trial.robot).frame
+                person = Person(device=page.device, view=page.view(gizmo=True), status=page.tell)
+                done = watch(trial, out, person, rollouts=int(rollouts.value), progress=page.progress)
+                return (
+                    f"{done.successes} successes, {done.failures} failures are in {out.relative_to(page.folder.path)}"
+                )
+
+            page.start("watch", job)
+
+        page.button("Watch", begin, color="blue", hint="adds to the recordings if they are there")
+        page.button("Look for policies", refresh)
+        refresh()
 
 
 def success_plot(page: Page) -> GuiUplotHandle:

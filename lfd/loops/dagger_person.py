@@ -15,9 +15,8 @@ from lfd.core.errors import InputError
 from lfd.core.protocols import BatchPolicy, Decision, Observation, Observer
 from lfd.experts.device import Device
 from lfd.experts.teleoperation import TeleopPolicy
-from lfd.loops.dagger_recipe import LoopRecipes
 from lfd.record.demonstrations import RecordRecipe, numbers_in
-from lfd.record.session import Sitting, Status, View, record_session
+from lfd.record.session import Session, Sitting, Status, View, record_session
 from lfd.run.gate_human import HumanGate
 from lfd.run.gates import Ensemble, GatedPolicy
 from lfd.worlds.robosuite_world import RobosuiteWorld
@@ -61,19 +60,24 @@ class Person:
         self,
         learners: Sequence[BatchPolicy],
         world: RobosuiteWorld,
-        recipes: LoopRecipes,
         generator: Callable[[int], np.random.Generator],
         recorder: Callable[[int], Observer],
         *,
         first: int,
         wanted: int,
-    ) -> None:
+        horizon: int,
+        hold_steps: int,
+        rest_seconds: float,
+        longer: str,
+    ) -> Session:
         """Rollouts of the learner in the person's care, from number `first` on, until `wanted` are recorded.
 
-        Raises `InputError` when the person quits before.
+        `horizon` and `hold_steps` are control steps of a rollout and of a success; the learner acts again after
+        `rest_seconds` of rest [s]. `longer` is what to type for longer rollouts. Raises `InputError` when the person
+        quits before.
         """
-        teleop, recipe = load_teleop(recipes.record.robot), recipes.dagger
-        rest = round(recipe.gate_rest_seconds * recipes.record.control_hz)
+        teleop = load_teleop(world.spec.robot)
+        rest = round(rest_seconds * world.spec.control_hz)
         gate = HumanGate(self.device, dead_band=teleop.dead_band, quiet_steps=rest)
         names = world.spec.labels["action"]
         hand = OneEach([TeleopPolicy(gate, world.spec, teleop)])
@@ -88,13 +92,14 @@ class Person:
             counted=lambda session: session.successes + session.failures,
             view=self.view,
             status=self.status,
-            horizon=recipes.horizon,
-            hold_steps=recipes.record.hold_steps,
-            longer="--set dagger.rollout_seconds=60",
+            horizon=horizon,
+            hold_steps=hold_steps,
+            longer=longer,
         )
         done = sitting.run(first)
         if done.successes + done.failures < wanted:
             raise InputError(QUIT)
+        return done
 
 
 class _Alone:

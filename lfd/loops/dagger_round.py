@@ -144,13 +144,15 @@ class Round:
 
     def _look_after(self, person: Person, recordings: Path) -> None:
         """Rollouts in a person's care; what they discard leaves a gap in the numbers."""
-        there, learners = numbers_in(recordings, "$"), self._learners()
-        wanted = self.recipes.dagger.episodes_per_round - len(there)
+        there, learners, recipes = numbers_in(recordings, "$"), self._learners(), self.recipes
+        wanted = recipes.dagger.episodes_per_round - len(there)
         if wanted > 0:
             person.look_after(
-                learners, self.worlds[0], self.recipes, self._generator,
+                learners, self.worlds[0], self._generator,
                 lambda number: self._recorder(recordings, learners[0].name, number),
                 first=max(there, default=-1) + 1, wanted=wanted,
+                horizon=recipes.horizon, hold_steps=recipes.record.hold_steps,
+                rest_seconds=recipes.dagger.gate_rest_seconds, longer="--set dagger.rollout_seconds=60",
             )  # fmt: skip
 
     def _index(self, number: int) -> int:

@@ -23,7 +23,7 @@ from lfd.core.protocols import (
     WorldState,
 )
 
-STAGES = ("record", "eval", "judge", "dagger")
+STAGES = ("record", "eval", "judge", "dagger", "watch")
 """What has a random stream of its own; the order is part of the seed."""
 
 
