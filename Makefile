@@ -32,6 +32,7 @@ results: $(READY)
 	$(BIN)/lfd bench dagger --results docs/results.md
 	$(BIN)/lfd bench irl --results docs/results.md
 	$(BIN)/lfd bench replay --results docs/results.md
+	$(BIN)/lfd bench console --results docs/results.md
 	$(BIN)/lfd experts --episodes 50 --results docs/results.md
 
 pictures: $(READY)

@@ -257,6 +257,25 @@ def _replay(given: Namespace) -> tuple[Measured, Measured]:
     return measured, {f"Replay: {given.task} with {given.robot}": rows}
 
 
+def _console(given: Namespace) -> tuple[Measured, Measured]:
+    from lfd.bench.console import bench_console
+
+    minutes, reload_every_s = (1.0, 20.0) if given.quick else (30.0, 60.0)
+    measured = asdict(
+        bench_console(minutes=minutes, reload_every_s=reload_every_s, seed=given.seed, progress=progress_bar)
+    )
+    rows: Measured = {"minutes": minutes, "episodes recorded": measured["episodes"], "reloads": measured["reloads"]}
+    rows["from an event to its control step: median, 95% within [ms]"] = _listed(measured["latency_ms"])
+    rows["from a page's last sign of life to the arm's rest: median, longest [ms]"] = _listed(measured["stood_ms"])
+    rows["memory of the server in each quarter [MB]"] = _listed(measured["memory_mb"])
+    rows["memory of the page's scripts in each quarter [MB]"] = _listed(measured["page_mb"])
+    return measured, {"Console: a page that is lost and loaded anew": rows}
+
+
+def _listed(values: tuple[float, ...]) -> str:
+    return ", ".join(f"{value:g}" for value in values)
+
+
 SUITES: dict[str, Suite] = {
     "sim": _sim,
     "cameras": _cameras,
@@ -270,5 +289,6 @@ SUITES: dict[str, Suite] = {
     "corrections": _corrections,
     "interaction": _interaction,
     "replay": _replay,
+    "console": _console,
 }
 """Name to suite."""

@@ -196,6 +196,7 @@ SUITES = (
     "corrections",
     "interaction",
     "replay",
+    "console",
 )
 """Names of `lfd.bench.suites`, which is imported when one runs."""
 
@@ -209,7 +210,8 @@ def _bench(commands: Commands) -> None:
         "LeRobot, robomimic, imitation, ours), compounding (errors against the horizon), dagger (success by labels), "
         "comparisons (alignment by answers), irl (three methods by demonstrations, imitation), "
         "corrections (what pushes teach, how soon they are noticed), interaction (four robots among people, planning "
-        "with either gradient), replay (faster than real time, sizes of Rerun files, what --live costs)",
+        "with either gradient), replay (faster than real time, sizes of Rerun files, what --live costs), "
+        "console (how late it is, memory over half an hour of reconnects)",
         "lfd bench sim --quick",
     )
     made.add_argument("suite", choices=SUITES, help="what to measure")

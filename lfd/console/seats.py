@@ -40,7 +40,10 @@ class Seats:
         self._driver = ""
         self._changed: list[Callable[[], None]] = []
         self.latencies_ms: deque[float] = deque(maxlen=LATENCIES)
+        self.heard_at = 0.0
 
+    heard_at: float
+    """When a driver was heard last, by the clock [s]."""
     latencies_ms: deque[float]
     """The latest latencies that pages measured, from an event to a control step and back."""
 
@@ -86,6 +89,7 @@ class Seats:
                 return
             seat.heard, seat.input = self._clock(), given
             if tab == self._driver:
+                self.heard_at = seat.heard
                 seat.said.extend(given.said)
                 self.latencies_ms.extend(given.late_ms)
 
