@@ -1,15 +1,26 @@
 import numpy as np
 import pytest
 import torch
+from torch.autograd.functional import hessian, jacobian
 
 from lfd.core.errors import InputError, UnknownName
-from lfd.interaction.driving_model import COAST, STEP_S, TYPES, Situation, person_reward
+from lfd.interaction.driving_model import (
+    COAST,
+    STEP_S,
+    TYPES,
+    Situation,
+    by_controls,
+    hardest_braking,
+    person_derivatives,
+    person_reward,
+)
 from lfd.interaction.driving_people import ACCELERATIONS, LOOK_AHEAD, BoltzmannDriver, choices_now, type_of
 from lfd.interaction.driving_robots import KINDS, DriverOptions, InteractiveDriver
 from lfd.interaction.receding_horizon import Limits, RecedingHorizon, shifted
 from lfd.interaction.responses import best_response
 from lfd.interaction.stackelberg import leader_gradient, plan_stackelberg
-from lfd.worlds.driving_world import ACTION_HIGH, ACTION_LOW, Car, DrivingWorld, load_scene
+from lfd.worlds.car_following import CarFollowing
+from lfd.worlds.driving_world import ACTION_HIGH, ACTION_LOW, LENGTH, Car, DrivingWorld, load_scene
 
 MERGE = load_scene("merge")
 ROBOT, PERSON = Car(6.0, -3.0, 0.05, 14.5), Car(0.0, 0.0, 0.0, 15.2)
@@ -27,6 +38,63 @@ def test_the_path_in_closed_form_is_that_of_the_worlds_steps(rng) -> None:
         np.testing.assert_allclose(there, [car.x, car.y, car.yaw, car.speed, person.x, person.speed], atol=1e-12)
 
 
+@pytest.mark.parametrize("speed", [0.0, 3.3, 15.0])
+def test_people_in_plans_brake_as_hard_as_they_can_and_do_not_drive_backwards(speed, rng) -> None:
+    low = hardest_braking(speed, 5)
+    car = Car(0.0, 0.0, 0.0, speed)
+    now = Situation(MERGE, ROBOT, car)
+    way, speeds = now.person_path(low)
+    for step in range(5):
+        car = car.moved(-4.0, 0.0, STEP_S)
+        assert float(speeds[step]) == pytest.approx(car.speed)
+        assert float(way[step]) == pytest.approx(car.x)
+    _, others = now.person_path(low + torch.from_numpy(rng.uniform(0.0, 2.0, (50, 5))))
+    assert (others >= 0.0).all()
+
+
+def test_the_second_cars_path_in_closed_form_is_that_of_steps_by_its_law(rng) -> None:
+    law, second = CarFollowing(), Car(-13.0, 0.0, 0.0, 14.0)
+    now, u = Situation(MERGE, ROBOT, PERSON, second), rng.uniform(-3.0, 2.0, (3, 5))
+    ways = now.second_path(torch.from_numpy(u), follows=True)
+    steady = now.second_path(torch.from_numpy(u), follows=False)
+    for row, each in enumerate(u):
+        person, car = PERSON, second
+        for step, a in enumerate([*each.tolist(), *[0.0] * COAST]):
+            wish = law.wish(person.x - car.x - LENGTH, car.speed, person.speed)
+            person, car = person.moved(a, 0.0, STEP_S), car.moved(wish, 0.0, STEP_S)
+            assert float(ways[row, step]) == pytest.approx(car.x - second.x, abs=1e-9)
+            assert float(steady[row, step]) == pytest.approx((step + 1) * STEP_S * second.speed)
+
+
+def test_the_persons_derivatives_in_closed_form_are_automatic_ones(rng) -> None:
+    theta = torch.tensor([[0.04, 0.25, 40.0, 3.0], [0.1, 0.3, 5.0, 40.0]], dtype=torch.float64)
+    x, y, _, _ = NOW.robot_path(torch.from_numpy(0.7 * rng.uniform(np.tile(ACTION_LOW, 5), np.tile(ACTION_HIGH, 5))))
+    u = torch.from_numpy(rng.uniform(-3.0, 2.0, (2, 5)))
+
+    def seen(u):
+        way, speed = NOW.person_path(u)
+        return *NOW.from_person(x[None], y[None], way), speed, u
+
+    def reward(u):
+        d, e, speed, u = seen(u)
+        return person_reward(MERGE, theta, d, e, speed, u).sum()
+
+    way, rate, one = (torch.from_numpy(each) for each in by_controls(5))
+    value, g, blocks = person_derivatives(torch.exp, (way, rate, one), MERGE, theta, seen(u))
+    assert float(value.sum()) == pytest.approx(float(reward(u)))
+    torch.testing.assert_close(g, jacobian(reward, u))
+    whole = -torch.as_tensor(hessian(reward, u))
+    for k in range(2):
+        torch.testing.assert_close(blocks[k], whole[k, :, k])
+    assert whole[0, :, 1].abs().max() == 0.0
+    d, e, speed, _ = (each.numpy() for each in seen(u))
+    arrays = d, e, speed, u.numpy()
+    for one_way, other in zip(
+        person_derivatives(np.exp, by_controls(5), MERGE, theta.numpy(), arrays), (value, g, blocks), strict=True
+    ):
+        np.testing.assert_allclose(one_way, other.numpy(), atol=1e-10)
+
+
 def test_choices_are_boltzmanns_over_rewards_summed_step_by_step() -> None:
     theta, action = torch.tensor(list(TYPES.values()), dtype=torch.float64), np.array([0.7, 0.02])
     logs = choices_now(NOW, theta, action, 0.3)
@@ -35,12 +103,12 @@ def test_choices_are_boltzmanns_over_rewards_summed_step_by_step() -> None:
         rewards = []
         for a in ACCELERATIONS.tolist():
             robot, person, value = ROBOT, PERSON, 0.0
-            for step in range(LOOK_AHEAD):
+            for step in range(LOOK_AHEAD["merge"]):
                 acceleration, steering = action.tolist() if step == 0 else (0.0, 0.0)
                 robot = robot.moved(acceleration, steering, STEP_S)
                 person = person.moved(a, 0.0, STEP_S)
                 row = [torch.tensor([v], dtype=torch.float64) for v in (robot.x - person.x, robot.y, person.speed, a)]
-                value += float(person_reward(MERGE.cruise, weights, *row))
+                value += float(person_reward(MERGE, weights, *row))
             rewards.append(0.3 * value)
         rows.append(torch.log_softmax(torch.tensor(rewards, dtype=torch.float64), 0))
     torch.testing.assert_close(logs, torch.stack(rows), atol=1e-10, rtol=0.0)
@@ -82,6 +150,13 @@ def test_the_gradient_through_people_of_several_types_is_that_of_finite_differen
 
     gradient = leader_gradient(leader, follower, u, answer(u), bounds=(-4.0, 2.5), followers=2)
     torch.testing.assert_close(gradient, leader_gradient(leader, follower, u, answer(u), bounds=(-4.0, 2.5)))
+
+    def closed(a, b):
+        return robot._person_derivatives(NOW, a, b)
+
+    known = {"bounds": (-4.0, 2.5), "followers": 2, "derivatives": closed}
+    torch.testing.assert_close(gradient, leader_gradient(leader, follower, u, answer(u), **known))
+    torch.testing.assert_close(answer(u), best_response(follower, u, torch.zeros(10, dtype=torch.float64), **known))
     for place in (0, 1, 4, 7):
         step = torch.zeros(10, dtype=torch.float64)
         step[place] = 1e-6

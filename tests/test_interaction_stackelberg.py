@@ -116,6 +116,27 @@ def test_a_flat_reward_is_singular_and_a_ridge_helps() -> None:
     )
 
 
+def test_a_plan_among_people_to_whom_some_is_the_same_tells_what_was_added() -> None:
+    def flat(u_robot, u_human):
+        return -((u_human[0] - u_robot[0]) ** 2)
+
+    with pytest.raises(SingularResponse, match="ridge=1e-6"):
+        plan_stackelberg(robot, flat, U, ZERO)
+    plan = plan_stackelberg(robot, flat, U, ZERO, robot_bounds=(-1.0, 1.0), ridge=1e-6)
+    assert plan.ridge == 1e-6
+    assert float(plan.u_human[1]) == 0.0  # they stay where they were
+    assert float(plan.u_human[0]) == pytest.approx(float(plan.u_robot[0]), abs=1e-8)
+    small = 1e-6  # the same person, who would rather not move
+    close = plan_stackelberg(robot, lambda a, b: flat(a, b) - small * b[1] ** 2, U, ZERO, robot_bounds=(-1.0, 1.0))
+    torch.testing.assert_close(plan.u_robot, close.u_robot, atol=1e-4, rtol=0.0)
+    assert close.ridge == 0.0
+    regular = plan_stackelberg(robot, curved, U, ZERO, ridge=1e-6, robot_bounds=(-1.0, 1.0))
+    assert regular.ridge == 0.0
+    assert regular.value == pytest.approx(plan_stackelberg(robot, curved, U, ZERO, robot_bounds=(-1.0, 1.0)).value)
+    with pytest.raises(SingularResponse):  # too little, beside a curvature of 2
+        plan_stackelberg(robot, flat, U, ZERO, ridge=1e-11)
+
+
 def test_what_has_no_answer_is_said() -> None:
     with pytest.raises(NoResponse, match="give bounds"):
         best_response(lambda _, u: u.sum(), U, ZERO)

@@ -1,9 +1,12 @@
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from lfd.core.errors import InputError, SimulationError, UnknownName
 from lfd.interaction.driving_people import BoltzmannDriver
+from lfd.worlds.car_following import CarFollowing
 from lfd.worlds.driving_world import (
     ACTION_HIGH,
     LENGTH,
@@ -12,8 +15,10 @@ from lfd.worlds.driving_world import (
     WIDTH,
     Car,
     DrivingWorld,
+    least_distance,
     load_scene,
     seen_cars,
+    seen_second,
     separation,
 )
 
@@ -111,7 +116,7 @@ def test_the_model_shows_the_cars_where_they_are() -> None:
     data = mujoco.MjData(model)
     mujoco.mj_setState(model, data, np.array(state.sim), mujoco.mjtState.mjSTATE_INTEGRATION)
     mujoco.mj_kinematics(model, data)
-    for car in ("robot_car", "person_car"):
+    for car in ("robot_car", "person_car", "second_car"):
         np.testing.assert_allclose(data.body(car).xpos, result.observation[f"{car}_pos"], atol=1e-12)
         np.testing.assert_allclose(data.body(car).xquat, result.observation[f"{car}_quat"], atol=1e-12)
 
@@ -121,6 +126,45 @@ def test_an_episode_breaks_off_when_the_cars_touch() -> None:
     world.reset(np.random.default_rng(0))
     failures = [world.step(np.array([-1.0, 0.03])).failure for _ in range(15)]
     assert any("the cars touched" in failure for failure in failures)
+
+
+def test_the_second_car_settles_at_its_headway_behind_the_first() -> None:
+    law, lead, car, dt = CarFollowing(), Car(30.0, 0.0, 0.0, 13.0), Car(0.0, 0.0, 0.0, 16.0), 0.2
+    for _ in range(300):
+        a = law.acceleration(lead.x - car.x - LENGTH, car.speed, lead.speed)
+        assert law.limits[0] <= a <= law.limits[1]
+        lead, car = lead.moved(0.0, 0.0, dt), car.moved(a, 0.0, dt)
+    assert car.speed == pytest.approx(13.0, abs=1e-3)
+    assert lead.x - car.x - LENGTH == pytest.approx(2.0 + 0.4 * 13.0, abs=1e-2)
+
+
+def test_the_second_car_brakes_for_a_robot_that_is_in_its_lane() -> None:
+    world = world_of(person=Steady())
+    seen = world.reset(np.random.default_rng(0))
+    assert set(world.spec.labels) >= {"second_car_pos", "second_car_distance"}
+    state, speeds = world.get_state(), {}
+    for lateral in (-3.5, -1.0):
+        sim = np.array(state.sim)
+        start = mujoco.MjModel.from_xml_string(state.model_xml)
+        data = mujoco.MjData(start)
+        mujoco.mj_setState(start, data, sim, mujoco.mjtState.mjSTATE_INTEGRATION)
+        data.qpos[:2] = seen["second_car_pos"][0] + LENGTH + 2.0, lateral
+        mujoco.mj_getState(start, data, sim, mujoco.mjtState.mjSTATE_INTEGRATION)
+        world.set_state(replace(state, sim=sim))
+        before = seen_second(world.step(np.zeros(2)).observation)
+        assert before is not None
+        speeds[lateral] = before.speed
+    assert speeds[-1.0] < speeds[-3.5] - 0.1
+
+
+def test_a_lane_is_free_when_both_cars_are_clear() -> None:
+    scene, robot, first = load_scene("merge"), Car(20.0, 0.1, 0.0, 15.0), Car(40.0, 0.0, 0.0, 15.0)
+    assert scene.is_done(robot, first, Car(0.0, 0.0, 0.0, 15.0))
+    assert not scene.is_done(robot, first, Car(14.5, 0.0, 0.0, 15.0))
+    seen = world_of().reset(np.random.default_rng(1))
+    assert least_distance(seen) == min(seen["person_car_distance"][0], seen["second_car_distance"][0])
+    assert seen_second(world_of("crossing").reset(np.random.default_rng(1))) is None
+    assert (scene.in_the_way, load_scene("crossing").in_the_way) == pytest.approx((WIDTH, (LENGTH + WIDTH) / 2.0))
 
 
 def test_a_lane_is_changed_when_the_robot_is_in_it_and_clear() -> None:

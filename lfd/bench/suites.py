@@ -220,17 +220,19 @@ def _corrections(given: Namespace) -> tuple[Measured, Measured]:
 
 
 def _interaction(given: Namespace) -> tuple[Measured, Measured]:
-    from lfd.bench.interaction import as_dict, bench_interaction, plot, sections_of
+    from lfd.bench.interaction import bench_interaction
+    from lfd.bench.interaction_report import as_dict, plot, sections_of
+    from lfd.interaction.scenes import SCENES
 
     measured = bench_interaction(
-        scenes=("merge",) if given.quick else ("merge", "crossing"),
+        scenes=("merge",) if given.quick else tuple(SCENES),
         episodes=10 if given.quick else 200,
         seed=given.seed,
         compared_steps=10 if given.quick else 30,
         progress=progress_bar,
     )
     if given.results is not None:
-        plot(measured, Path("docs/pictures"))
+        plot(measured, Path("docs/pictures/interaction.png"))
     return as_dict(measured), sections_of(measured)
 
 

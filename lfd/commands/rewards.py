@@ -14,6 +14,8 @@ from lfd.core.errors import InputError
 
 METHODS = ("apprenticeship", "margin", "maxent")
 """Names of `lfd.loops.inverse_rl`, which is imported when one runs."""
+PEOPLE = "people"
+"""`lfd.loops.learning_people`: for what people did, not the arm."""
 TABLES = ("plan", "convert")
 
 
@@ -163,21 +165,29 @@ def _irl(commands: Commands) -> None:
         "lfd irl maxent --dataset outputs/cup --out outputs/reward",
     )
     made.epilog += "\n         lfd irl margin --dataset outputs/cup --holdout 3 --out outputs/judged"
+    made.epilog += "\n         lfd irl people --dataset outputs/merge --type aggressive --out outputs/aggressive"
     made.add_argument(
-        "method", choices=METHODS,
-        help="apprenticeship (Abbeel and Ng), margin (maximum margin planning), maxent (maximum entropy)",
+        "method", choices=(*METHODS, PEOPLE),
+        help="apprenticeship (Abbeel and Ng), margin (maximum margin planning), maxent (maximum entropy), people "
+        "(maximum entropy over what the people of `lfd interact merge` or `crossing` chose)",
     )  # fmt: skip
     made.add_argument(
         "--dataset", type=Path, required=True, metavar="RECORDINGS|DATASET",
-        help="recordings of plans (`lfd plan`), or the LeRobot dataset made of them",
+        help="recordings of plans (`lfd plan`), or the LeRobot dataset made of them; people: recordings of `lfd "
+        "interact` with people of one type",
     )  # fmt: skip
     _feature_names(made, "those of the demonstrator")
     made.add_argument(
         "--holdout", type=int, default=0, metavar="N",
-        help="scenes, the last ones, that nothing is learned from; where the demonstrator's weights are known, they "
-        "judge the learned reward's plans there",
+        help="scenes (people: recordings), the last ones, that nothing is learned from; where the demonstrator's "
+        "weights are known, they judge the learned reward's plans there",
     )  # fmt: skip
     made.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the candidates (default: 0)")
+    made.add_argument("--type", metavar="TYPE", help="people: whose weights they are, passive or aggressive")
+    made.add_argument(
+        "--rationality", type=float, default=0.3, metavar="R",
+        help="people: how strictly they choose what is best; it sets the scale of the weights (default: 0.3)",
+    )  # fmt: skip
     made.add_argument(
         "--reward", type=Path, metavar="OLD",
         help="a reward to which the demonstrations are added as further evidence, whatever it was learned from; "
@@ -188,6 +198,8 @@ def _irl(commands: Commands) -> None:
 
 def run_irl(given: Namespace) -> Result:
     """A reward from demonstrations."""
+    if given.method == PEOPLE:
+        return _learn_people(given)
     from lfd.core.artifact import check_output, sha256
     from lfd.loops.arm_evidence import load_evidence
     from lfd.loops.inverse_rl import Problem, convergence_picture, identifiable, joined, learn
@@ -229,6 +241,30 @@ def run_irl(given: Namespace) -> Result:
         },
     )
     return {"out": str(given.out), **(report if given.json else _shown(report))}
+
+
+def _learn_people(given: Namespace) -> Result:
+    """What people are after, from recordings of interactions."""
+    from lfd.loops.learning_people import learn_people
+    from lfd.terminal import progress_bar
+
+    if given.type is None or given.features or given.reward:
+        raise InputError("lfd irl people has features of its own and learns a reward anew: give --type TYPE instead")
+    report = learn_people(
+        given.dataset, given.type, given.out, holdout=given.holdout, rationality=given.rationality,
+        overwrite=given.overwrite, progress=progress_bar,
+    )  # fmt: skip
+    if given.json:
+        return {"out": str(given.out), **asdict(report)}
+    reward, held_out = report.reward, report.held_out or {}
+    rows = zip(reward.features, reward.weights, reward.spread, strict=True)
+    told: Result = {"out": str(given.out), **{name: f"{w:.4g} +- {s:.2g}" for name, w, s in rows}}
+    told["choices"] = f"{reward.choices}, {reward.log_likelihood:.3f} nat each" + " (NOT CONVERGED)" * (
+        not report.converged
+    )
+    if held_out:
+        told["held out"] = "nat for each choice: " + ", ".join(f"{name} {x:.3f}" for name, x in held_out.items())
+    return told
 
 
 def _shown(report: Result) -> Result:

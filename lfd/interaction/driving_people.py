@@ -1,6 +1,6 @@
 """People at the wheel: a Boltzmann choice among accelerations, by what each would lead to (chapter 10.6.2).
 
-    p(a | x, u_R, theta) ~ exp(rationality R_H(theta)),    a in ACCELERATIONS, held for `LOOK_AHEAD` steps of the plan
+    p(a | x, u_R, theta) ~ exp(rationality R_H(theta)),    a in ACCELERATIONS, held for `LOOK_AHEAD` steps
 
 They see what the robot does now, not what it plans: for R_H it does so for a step of the plan, then goes straight on.
 """
@@ -16,7 +16,8 @@ from lfd.worlds.driving_world import WHEELBASE, Car, DrivingScene
 
 ACCELERATIONS = torch.linspace(PERSON_LOW, PERSON_HIGH, 14, dtype=torch.float64)
 """What people choose from [m/s^2]."""
-LOOK_AHEAD = 4
+LOOK_AHEAD = {"merge": 4, "crossing": 8}
+"""Steps of the plan that people look ahead, by scene: over a crossing, which is seen from afar, as far as plans do."""
 SPREAD = 0.2
 """Standard deviation of the logarithm of a person's weights about their type's."""
 PEOPLE = (*sorted(TYPES), "random")
@@ -37,7 +38,8 @@ def choice_rewards(
     start, way, speed = person
     x, y, yaw, v = robot
     acceleration, steering = first
-    steps = torch.arange(1, LOOK_AHEAD + 1, dtype=torch.float64) * STEP_S
+    ahead = LOOK_AHEAD[scene.name]
+    steps = torch.arange(1, ahead + 1, dtype=torch.float64) * STEP_S
     later = Situation(scene, Car(0.0, 0.0, 0.0, 0.0), start)
     v1 = v + STEP_S * acceleration
     yaw1 = yaw + STEP_S * v * torch.tan(steering) / WHEELBASE
@@ -49,9 +51,7 @@ def choice_rewards(
     before = torch.cat([speed[:, None, None].expand(-1, len(a), 1), speeds[..., :-1]], dim=-1)
     ways = way[:, None, None] + STEP_S * before.cumsum(-1)
     d, e = later.from_person(xs[:, None], ys[:, None], ways)
-    return person_reward(
-        scene.cruise, theta[:, None], d[:, None], e[:, None], speeds[:, None], a.expand(len(a), LOOK_AHEAD)
-    )
+    return person_reward(scene, theta[:, None], d[:, None], e[:, None], speeds[:, None], a.expand(len(a), ahead))
 
 
 def choices_now(

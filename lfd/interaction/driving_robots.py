@@ -1,6 +1,6 @@
 """Robots that drive among people: one planner, with what it takes people for as an option (chapter 10.6).
 
-    obstacle   they keep their speed, whatever the robot does
+    obstacle   they keep their speed, whatever the robot does, and so does who follows them
     known      they have one theta, given: u_H* = argmax R_H(u_R, u_H, theta)
     passive    theta is one of some types: argmax sum_theta b(theta) R_goal(u_R, u_H*(theta)), b updated by what is seen
     active     the same, with information: argmax I(b, u_R) + lambda(t) sum_theta b(theta) R_goal
@@ -29,14 +29,18 @@ from lfd.interaction.driving_model import (
     TYPES,
     Situation,
     before,
+    by_controls,
     goal_reward,
+    hardest_braking,
+    person_derivatives,
     person_reward,
+    seen_from,
 )
 from lfd.interaction.driving_people import ACCELERATIONS, choice_rewards, choices_now
 from lfd.interaction.information import information_gain
 from lfd.interaction.intent import IntentBelief
 from lfd.interaction.receding_horizon import Limits, RecedingHorizon
-from lfd.worlds.driving_world import ACTION_HIGH, ACTION_LOW, Car, DrivingScene, seen_cars
+from lfd.worlds.driving_world import ACTION_HIGH, ACTION_LOW, Car, DrivingScene, seen_cars, seen_second
 
 KINDS = ("obstacle", "known", "passive", "active")
 STILL = 1e-6
@@ -63,13 +67,21 @@ class DriverOptions:
     """lambda_0 of the active robot."""
     patience_s: float = 2.0
     """tau of the active robot [s]."""
+    learned: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    """Types with the theta that was learned for them (`lfd.interaction.person_reward`), in place of the known one."""
+
+    @property
+    def theta(self) -> dict[str, tuple[float, ...]]:
+        """Of each type, as the robot believes."""
+        return TYPES | dict(self.learned)
 
     def check(self) -> None:
         """Raise `UnknownName` for another kind or type, `InputError` for numbers out of range."""
         if self.kind not in KINDS:
             raise UnknownName("robot kind", self.kind, KINDS)
-        if self.assumed not in TYPES:
-            raise UnknownName("type of person", self.assumed, TYPES)
+        for name in (self.assumed, *dict(self.learned)):
+            if name not in TYPES:
+                raise UnknownName("type of person", name, TYPES)
         for name in ("horizon", "rationality", "goal_weight", "patience_s"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} = {getattr(self, name)}: give a number above 0")
@@ -83,7 +95,7 @@ class InteractiveDriver:
         self.name, self._scene, self._dt, self._options = options.kind, scene, 1.0 / control_hz, options
         names = [options.assumed] if options.kind in ("known", "obstacle") else sorted(TYPES)
         self._names = tuple(names)
-        self._theta = torch.tensor([TYPES[name] for name in names], dtype=torch.float64)
+        self._theta = torch.tensor([options.theta[name] for name in names], dtype=torch.float64)
         bounds = (torch.tensor(np.tile(end, options.horizon)) for end in (ACTION_LOW, ACTION_HIGH))
         low, high = bounds
         self._low, self._high = low, high
@@ -105,10 +117,11 @@ class InteractiveDriver:
         self.planner.forget()
         self._belief = IntentBelief(self._names, torch.ones(len(self._names)))
         self._before: tuple[Situation, np.ndarray] | None = None
+        self._looked: tuple[Situation, Tensor, tuple[np.ndarray, np.ndarray]] | None = None
         self._time = 0.0
 
     def act(self, observation: Observation) -> Decision:
-        now = Situation(self._scene, *seen_cars(observation))
+        now = Situation(self._scene, *seen_cars(observation), seen_second(observation))
         if self._before is not None and len(self._names) > 1:
             self._belief = self._belief.updated(self._log_likelihood(now.person))
         size = self._options.horizon * len(self._names)
@@ -120,6 +133,8 @@ class InteractiveDriver:
             shift=self._dt / STEP_S,
             controls=2,
             followers=len(self._names),
+            derivatives=lambda u_robot, u_human: self._person_derivatives(now, u_robot, u_human),
+            person=(hardest_braking(now.person.speed, self._options.horizon).repeat(len(self._names)), PERSON_HIGH),
         )
         action = plan.u_robot[:2].numpy().copy()
         self._before, self._time = (now, action), self._time + self._dt
@@ -145,12 +160,48 @@ class InteractiveDriver:
         if self._options.kind == "obstacle":
             return -(u_human**2).sum(-1)
         u, _, d, e, speed = self._together(now, u_robot, u_human)
-        return person_reward(self._scene.cruise, self._theta, d, e, speed, u).sum(-1)
+        return person_reward(self._scene, self._theta, d, e, speed, u).sum(-1)
+
+    def _person_derivatives(self, now: Situation, u_robot: Tensor, u_human: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The same, its slope, and minus its Hessian, a block for each type: with numpy, which is several times as fast
+        on arrays of this size, where torch is not needed to go back to u_robot."""
+        steps = self._options.horizon
+        if self._options.kind == "obstacle":
+            one = torch.eye(steps, dtype=torch.float64).expand(*u_human.shape[:-1], 1, -1, -1)
+            return self._person_reward(now, u_robot, u_human), -2.0 * u_human, 2.0 * one
+        per_control = by_controls(steps)
+        if u_robot.requires_grad:
+            u, _, d, e, speed = self._together(now, u_robot, u_human)
+            way, rate, one = (torch.from_numpy(each) for each in per_control)
+            value, g, blocks = person_derivatives(
+                torch.exp, (way, rate, one), self._scene, self._theta, (d, e, speed, u)
+            )
+            return value.sum(-1), g.flatten(-2), blocks
+        ahead, e = self._ahead(now, u_robot)
+        u = u_human.numpy().reshape(*u_human.shape[:-1], len(self._names), steps)
+        way, rate, _ = per_control
+        going = now.person.speed * STEP_S * np.arange(1, len(way) + 1)
+        seen = ahead - going - u @ way.T, e, now.person.speed + u @ rate.T, u
+        found = person_derivatives(np.exp, per_control, self._scene, self._theta.numpy(), seen)
+        value, g, blocks = (torch.from_numpy(np.ascontiguousarray(each)) for each in found)
+        return value.sum(-1), g.flatten(-2), blocks
+
+    def _ahead(self, now: Situation, u_robot: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """How far ahead of where the person is now the robot will be, and how far beside; the last answer is kept."""
+        if self._looked is None or self._looked[0] is not now or not torch.equal(self._looked[1], u_robot):
+            path = now.robot_path(u_robot)
+            d, e = now.from_person(path[0], path[1], torch.zeros((), dtype=torch.float64))
+            self._looked = now, u_robot, (d[..., None, :].numpy(), e[..., None, :].numpy())
+        return self._looked[2]
 
     def _robot_reward(self, now: Situation, u_robot: Tensor, u_human: Tensor) -> Tensor:
-        _, path, d, e, speed = self._together(now, u_robot, u_human)
+        u, path, d, e, speed = self._together(now, u_robot, u_human)
+        cars = [(d, e)]
+        if now.second is not None:
+            way = now.second_path(u, follows=self._options.kind != "obstacle")
+            cars.append(seen_from(now.second, path[0][..., None, :], path[1][..., None, :], way))
         b = self._belief.probabilities
-        goal = goal_reward(GOALS[self._scene.name], self._scene.cruise, u_robot, path, d, e) @ b
+        goal = goal_reward(GOALS[self._scene.name], self._scene.cruise, u_robot, path, cars) @ b
         if self._options.kind != "active":
             return goal
         weight = self._options.goal_weight * np.exp(self._time / self._options.patience_s)

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lfd.core.errors import InputError
-from lfd.interaction.responses import Bounds, Reward, best_response, limits, vector
+from lfd.interaction.responses import Bounds, Derivatives, Reward, best_response, limits, vector
 from lfd.interaction.stackelberg import Plan, plan_stackelberg
 
 TOLERANCE = 1e-4
@@ -29,6 +29,8 @@ class Limits:
     """Gradients for each plan, at the most but for the last line search."""
     difference: float = 0.0
     """Step of finite differences in the implicit gradient's place; 0 for the implicit one."""
+    ridge: float = 0.0
+    """For people whose answer is singular, as in `plan_stackelberg`; 0 refuses them."""
 
     def check(self) -> None:
         """Raise `InputError` for numbers out of range."""
@@ -63,12 +65,15 @@ class RecedingHorizon:
         shift: float,
         controls: int,
         followers: int,
+        derivatives: Derivatives | None = None,
+        person: Bounds | None = None,
     ) -> Plan:
         """The best plan from the last one and from `starts`.
 
         Rewards take a batch in front: (S, n) and (S, m) give (S,), so that the answers to all starts cost about as much
         as one. `shift` steps of the last plan have been carried out, a part of one included, each of `controls`
-        numbers; `followers` as in `best_response`.
+        numbers; `followers` as in `best_response`. `derivatives` take a batch in front too: R_H is (S,), g (S, m), the
+        blocks are (S, followers, k, k). `person` are bounds for this plan in place of the limits'.
 
         Raises `InputError` for starts outside the limits, and what `plan_stackelberg` raises.
         """
@@ -82,13 +87,22 @@ class RecedingHorizon:
             warm = shifted(self._last.u_human, shift, 1, followers)
             answers = torch.cat([warm[None], answers])
         count = len(starts)
+        low_human, high_human = limits(person or within.person, answers[0])
+
+        def of_all(u_robot: Tensor, u_human: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            assert derivatives is not None
+            values, g, blocks = derivatives(u_robot.view(count, -1), u_human.view(count, -1))
+            return values.sum(), g.flatten(), blocks.flatten(0, 1)
+
         given = best_response(
             lambda u_robot, u_human: reward_human(u_robot.view(count, -1), u_human.view(count, -1)).sum(),
             starts.reshape(-1),
             answers.reshape(-1),
-            bounds=within.person,
+            bounds=(low_human.repeat(count), high_human.repeat(count)),
             tolerance=TOLERANCE,
+            ridge=within.ridge,
             followers=count * followers,
+            derivatives=of_all if derivatives is not None else None,
         ).view(count, -1)
         best = int(reward_robot(starts, given).argmax())
         plan = plan_stackelberg(
@@ -96,11 +110,13 @@ class RecedingHorizon:
             reward_human,
             starts[best],
             given[best],
-            bounds=within.person,
+            bounds=(low_human, high_human),
             robot_bounds=within.robot,
             max_gradients=within.gradients,
             difference=within.difference,
+            ridge=within.ridge,
             followers=followers,
+            derivatives=derivatives,
             response_tolerance=TOLERANCE,
         )
         self._last = replace(plan, human_solves=plan.human_solves + count)

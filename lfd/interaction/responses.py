@@ -19,6 +19,9 @@ from lfd.core.errors import InputError
 
 Reward = Callable[[Tensor, Tensor], Tensor]
 """(u_robot, u_human) to a scalar."""
+Derivatives = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+"""(u_robot, u_human) to R_H, g (m,) and a block of -dg/du_H for each follower (followers, k, k), in closed form. Where
+u_robot requires its gradient, g is made of operations that can be differentiated by it."""
 Bounds = tuple[Tensor | float, Tensor | float]
 """Lowest and highest controls, one number or one for each."""
 MOST_STEPS = 200
@@ -45,53 +48,60 @@ def best_response(
     *,
     bounds: Bounds | None = None,
     tolerance: float = 1e-10,
+    ridge: float = 0.0,
     followers: int = 1,
+    derivatives: Derivatives | None = None,
 ) -> Float[Tensor, "m"]:
     """u_H*, a local maximum of R_H near `u_human_init`, by Newton's method on the free controls with a line search.
 
     Where -d2R_H/du_H2 is not positive definite, its eigenvalues are replaced by their absolute values, so that every
     step goes up. `tolerance` bounds the gradient's largest free component, relative to 1 + the largest gradient met.
     With `followers` the controls are those of so many people, one after the other, whose rewards add up and have no
-    person's controls in common with another's: the Hessian's blocks then cost what one of them does.
+    person's controls in common with another's: the Hessian's blocks then cost what one of them does. `derivatives` of
+    R_H in closed form, where there are such, spare automatic differentiation, which takes most of the time.
 
-    Raises `SingularResponse` where the free Hessian is singular at the answer, `NoResponse` where R_H grows without end
-    or the search does not converge, `InputError` for shapes that do not fit, NaN, or bounds that cross.
+    Raises `SingularResponse` where the free Hessian is singular at the answer, unless there is a `ridge`: then people
+    stay where they were along directions in which all is as good to them. Raises `NoResponse` where R_H grows without
+    end or the search does not converge, `InputError` for shapes that do not fit, NaN, or bounds that cross.
     """
     u, u_robot = vector("u_human_init", u_human_init), vector("u_robot", u_robot)
     low, high = limits(bounds, u)
     u = torch.clamp(u, low, high)
 
-    def value(u: Tensor) -> Tensor:
-        return reward_human(u_robot, u).detach()
+    closed = None if derivatives is None else _remembering(derivatives)
 
-    scale, largest = 1.0, 0.0
+    def value(u: Tensor) -> Tensor:
+        return (reward_human(u_robot, u) if closed is None else closed(u_robot, u)[0]).detach()
+
+    scale, largest, here = 1.0, 0.0, float(value(u))
     for _ in range(MOST_STEPS):
-        g, curvature, _ = slope_and_curvature(reward_human, u_robot, u, (low, high), followers)
+        g, curvature, _ = slope_and_curvature(reward_human, u_robot, u, (low, high), followers, closed)
         largest = float(g.abs().max())
         scale = max(scale, largest)
         size, directions = torch.linalg.eigh(curvature)
         steepest = size.abs().amax(dim=1, keepdim=True)
         if largest <= tolerance * scale:
             if (size >= -SINGULAR * steepest).all():
-                _check_regular(size)
+                _regular(size, ridge)
                 return u
             worst = int((size[:, 0] / steepest[:, 0]).argmin())  # a saddle: go along what curves upwards
             step = torch.zeros_like(size)
             step[worst] = directions[worst, :, 0] * 1e-3 * (1.0 + float(u.abs().max()))
             ends = [torch.clamp(u + sign * step.flatten(), low, high) for sign in (1.0, -1.0)]
-            u = max(ends, key=lambda tried: float(value(tried)))
+            here, u = max(((float(value(tried)), tried) for tried in ends), key=lambda tried: tried[0])
             continue
         least = torch.clamp(SINGULAR * steepest, min=largest / (FARTHEST * (1.0 + float(u.abs().max()))))
         turned = (directions.mT @ g.view(followers, -1, 1))[..., 0] / torch.maximum(size.abs(), least)
-        moved = _search(value, u, (directions @ turned[..., None]).flatten(), g, low, high)
+        newton = (directions @ turned[..., None]).flatten()
+        moved, there = _search(value, u, here, newton, g, low, high)
         if moved is None:  # bounds may bend Newton's step away from what is better, the gradient's never
-            moved = _search(value, u, g / float(steepest.max()), g, low, high)
+            moved, there = _search(value, u, here, g / float(steepest.max()), g, low, high)
         if moved is None and largest <= 1e-6 * scale:  # rounding: nothing nearby is better
-            _check_regular(size)
+            _regular(size, ridge)
             return u
         if moved is None or float(moved.abs().max()) > FARTHEST:
             break
-        u = moved
+        u, here = moved, there
     raise NoResponse(
         f"the person's best response was not found: at u_human = {u.tolist()} the largest slope is {largest:.2g}. "
         "R_H may grow without end: give bounds, or a reward that punishes large controls"
@@ -106,12 +116,13 @@ def response_jacobian(
     bounds: Bounds | None = None,
     ridge: float = 0.0,
 ) -> Float[Tensor, "m n"]:
-    """du_H*/du_R at a best response; `ridge` is added to -d2R_H/du_H2, for rewards that are flat.
+    """du_H*/du_R at a best response; `ridge` is added to -d2R_H/du_H2 where that is singular.
 
-    Raises `SingularResponse` where the free Hessian is singular, `InputError` for shapes that do not fit or NaN.
+    Raises `SingularResponse` where the free Hessian is singular, with the ridge if there is one, `InputError` for
+    shapes that do not fit or NaN.
     """
     u_robot, u_human = vector("u_robot", u_robot), vector("u_human", u_human)
-    free, curvature = regular_curvature(reward_human, u_robot, u_human, bounds, ridge)
+    free, curvature, _ = regular_curvature(reward_human, u_robot, u_human, bounds, ridge)
     g, leader, _ = slope_of(reward_human, u_robot, u_human)
     mixed = rows(g, leader, torch.eye(len(g), dtype=torch.float64))
     return torch.linalg.solve(curvature[0], mixed * free[:, None])
@@ -124,12 +135,18 @@ def regular_curvature(
     bounds: Bounds | None,
     ridge: float,
     followers: int = 1,
-) -> tuple[Bool[Tensor, "m"], Float[Tensor, "followers k k"]]:
-    """Which controls are free at a best response, and -dg/du_H there, as `slope_and_curvature` has it."""
-    _, curvature, free = slope_and_curvature(reward_human, u_robot, u_human, limits(bounds, u_human), followers)
-    curvature = curvature + ridge * torch.eye(curvature.shape[1], dtype=torch.float64)
-    _check_regular(torch.linalg.eigvalsh(curvature))
-    return free, curvature
+    derivatives: Derivatives | None = None,
+) -> tuple[Bool[Tensor, "m"], Float[Tensor, "followers k k"], float]:
+    """Which controls are free at a best response, -dg/du_H there, as `slope_and_curvature` has it, and what had to be
+    added to its diagonal."""
+    within = limits(bounds, u_human)
+    _, curvature, free = slope_and_curvature(reward_human, u_robot, u_human, within, followers, derivatives)
+    flat = _regular(torch.linalg.eigvalsh(curvature), ridge)
+    if not flat.any():
+        return free, curvature, 0.0
+    curvature = curvature + ridge * torch.diag_embed(flat.double()[:, None].expand(-1, curvature.shape[1]))
+    _regular(torch.linalg.eigvalsh(curvature), 0.0)
+    return free, curvature, ridge
 
 
 def limits(bounds: Bounds | None, u: Float[Tensor, "m"]) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
@@ -174,6 +191,7 @@ def slope_and_curvature(
     u_human: Float[Tensor, "m"],
     bounds: tuple[Tensor, Tensor],
     followers: int,
+    derivatives: Derivatives | None = None,
 ) -> tuple[Float[Tensor, "m"], Float[Tensor, "followers k k"], Bool[Tensor, "m"]]:
     """g and -dg/du_H of each follower, for the free controls: others have slope 0, and the block's largest curvature on
     the diagonal alone; and which are free.
@@ -181,11 +199,14 @@ def slope_and_curvature(
     One batched reverse pass for the rows takes an eighth of `torch.func.hessian`'s time. Raises `InputError` for a
     slope that is not finite.
     """
-    g, _, follower = slope_of(reward, u_robot, u_human, by_leader=False)
-    size = len(g) // followers
-    each = torch.eye(size, dtype=torch.float64).repeat(1, followers)
-    curvature = -rows(g, follower, each).view(size, followers, size).transpose(0, 1)
-    g = g.detach()
+    if derivatives is not None:
+        _, g, curvature = derivatives(u_robot, u_human)
+    else:
+        g, _, follower = slope_of(reward, u_robot, u_human, by_leader=False)
+        size = len(g) // followers
+        each = torch.eye(size, dtype=torch.float64).repeat(1, followers)
+        curvature = -rows(g, follower, each).view(size, followers, size).transpose(0, 1)
+        g = g.detach()
     _check_finite(g, u_human)
     is_free = free_controls(u_human, g, *bounds)
     free = is_free.double().view(followers, -1)
@@ -202,31 +223,46 @@ def rows(g: Float[Tensor, "m"], by: Float[Tensor, "k"], each: Float[Tensor, "r m
     return torch.autograd.grad(g, by, each, is_grads_batched=True, allow_unused=True, materialize_grads=True)[0]
 
 
-def _search(value: Callable, u: Tensor, step: Tensor, slope: Tensor, low: Tensor, high: Tensor) -> Tensor | None:
-    """The first point along the projected step that gains enough (Armijo; Bertsekas 1982); none if none gains at
-    all."""
-    here, length = float(value(u)), 1.0
+def _search(
+    value: Callable, u: Tensor, here: float, step: Tensor, slope: Tensor, low: Tensor, high: Tensor
+) -> tuple[Tensor | None, float]:
+    """The first point along the projected step that gains enough (Armijo; Bertsekas 1982), none if none gains at all;
+    and the value there."""
+    length = 1.0
     for _ in range(60):
         moved = torch.clamp(u + length * step, low, high)
-        gain, promised = float(value(moved)) - here, float(slope @ (moved - u))
-        if gain >= 1e-4 * promised and promised > 0.0:
-            if torch.equal(moved, u):
-                return None
-            return moved
+        there, promised = float(value(moved)), float(slope @ (moved - u))
+        if there - here >= 1e-4 * promised and promised > 0.0:
+            return (None, here) if torch.equal(moved, u) else (moved, there)
         length /= 2.0
-    return None
+    return None, here
 
 
-def _check_regular(curvatures: Float[Tensor, "followers k"]) -> None:
+def _remembering(derivatives: Derivatives) -> Derivatives:
+    """The same, which answers at once when it is asked about the same tensor again."""
+    last: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+
+    def remembered(u_robot: Tensor, u_human: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        nonlocal last
+        if last is None or last[0] is not u_human:
+            last = u_human, derivatives(u_robot, u_human)
+        return last[1]
+
+    return remembered
+
+
+def _regular(curvatures: Float[Tensor, "followers k"], ridge: float) -> Bool[Tensor, "followers"]:
+    """Whose curvature is singular. Raises `SingularResponse` for anyone's if there is no ridge to help."""
     smallest, largest = curvatures.amin(dim=1), curvatures.abs().amax(dim=1)
     flat = smallest <= SINGULAR * largest
-    if flat.any():
+    if ridge == 0.0 and flat.any():
         at = int(flat.double().argmax())
         raise SingularResponse(
             f"the curvatures of the person's reward at their answer run from {float(smallest[at]):.3g} to "
             f"{float(largest[at]):.3g}: along a flat "
-            "direction anything is as good; add a small cost of effort to R_H, or give ridge=1e-6"
+            "direction anything is as good; add a small cost of effort to reward_human, or give ridge=1e-6, or more"
         )
+    return flat
 
 
 def _check_finite(g: Tensor, u: Tensor) -> None:

@@ -15,7 +15,16 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from lfd.core.errors import InputError
-from lfd.interaction.responses import Bounds, Reward, best_response, limits, regular_curvature, slope_of, vector
+from lfd.interaction.responses import (
+    Bounds,
+    Derivatives,
+    Reward,
+    best_response,
+    limits,
+    regular_curvature,
+    slope_of,
+    vector,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +42,8 @@ class Plan:
     """Best responses that were computed."""
     status: str
     """How the search ended, in the optimiser's words."""
+    ridge: float = 0.0
+    """What was added to -d2R_H/du_H2 where it was singular on the way; 0 where it never was."""
 
 
 def leader_gradient(
@@ -44,29 +55,47 @@ def leader_gradient(
     bounds: Bounds | None = None,
     ridge: float = 0.0,
     followers: int = 1,
+    derivatives: Derivatives | None = None,
 ) -> Float[Tensor, "n"]:
-    """dJ/du_R at u_H = u_H*(u_R); `bounds` are the person's, `ridge` is added to -dg/du_H.
-    `followers` as in `best_response`.
+    """dJ/du_R at u_H = u_H*(u_R); `bounds` are the person's, `ridge` as in `response_jacobian`, `followers` and
+    `derivatives` as in `best_response`.
 
     Raises what `response_jacobian` raises.
     """
     u_robot, u_human = vector("u_robot", u_robot), vector("u_human", u_human)
+    return _gradient_and_ridge(reward_robot, reward_human, u_robot, u_human, bounds, ridge, followers, derivatives)[1]
+
+
+def _gradient_and_ridge(
+    reward_robot: Reward,
+    reward_human: Reward,
+    u_robot: Float[Tensor, "n"],
+    u_human: Float[Tensor, "m"],
+    bounds: Bounds | None,
+    ridge: float,
+    followers: int,
+    derivatives: Derivatives | None,
+) -> tuple[float, Float[Tensor, "n"], float]:
+    """J, its gradient, and what was added to the person's curvature for it."""
     with torch.enable_grad():
         leader, follower = (u.clone().requires_grad_(True) for u in (u_robot, u_human))
-        own, through = torch.autograd.grad(
-            reward_robot(leader, follower), (leader, follower), allow_unused=True, materialize_grads=True
-        )
+        value = reward_robot(leader, follower)
+        own, through = torch.autograd.grad(value, (leader, follower), allow_unused=True, materialize_grads=True)
     if not (torch.isfinite(own).all() and torch.isfinite(through).all()):
         raise InputError(
             f"reward_robot has no finite slope at u_robot = {u_robot.tolist()}, u_human = {u_human.tolist()}"
         )
-    free, curvature = regular_curvature(reward_human, u_robot, u_human, bounds, ridge, followers)
+    free, curvature, added = regular_curvature(reward_human, u_robot, u_human, bounds, ridge, followers, derivatives)
     weight = torch.linalg.solve(curvature, (through * free).view(followers, -1, 1)).flatten()
-    g, leader, _ = slope_of(reward_human, u_robot, u_human)
+    if derivatives is None:
+        g, leader, _ = slope_of(reward_human, u_robot, u_human)
+    else:
+        with torch.enable_grad():
+            _, g, _ = derivatives(leader, u_human)
     if not g.requires_grad:
-        return own
-    (push,) = torch.autograd.grad(g, leader, weight, allow_unused=True, materialize_grads=True)
-    return own + push
+        return float(value.detach()), own, added
+    (push,) = torch.autograd.grad(g @ weight, leader, allow_unused=True, materialize_grads=True)
+    return float(value.detach()), own + push, added
 
 
 def plan_stackelberg(
@@ -83,6 +112,7 @@ def plan_stackelberg(
     ridge: float = 0.0,
     difference: float = 0.0,
     followers: int = 1,
+    derivatives: Derivatives | None = None,
     response_tolerance: float = 1e-10,
 ) -> Plan:
     """The best point met on the way to a local maximum of J near `u_robot_init`, by L-BFGS-B with the gradient above.
@@ -90,8 +120,9 @@ def plan_stackelberg(
     `bounds` are the person's, `robot_bounds` the robot's, whose width is the unit of each control. Each best response
     begins at the last one, the warm start of a receding horizon is the plan before, shifted. The search ends with the
     iteration in which it has computed `max_gradients` gradients. With `difference` the gradient is (J(u + e) -
-    J(u - e)) / 2|e| for steps of this size, 2n best responses more: what implicit differentiation spares. `followers`
-    and `response_tolerance` are those of `best_response`.
+    J(u - e)) / 2|e| for steps of this size, 2n best responses more: what implicit differentiation spares. `ridge`,
+    `followers`, `derivatives` and `response_tolerance` are those of `best_response`; a person whose answer is
+    singular is refused unless there is a ridge, and the plan tells whether it was needed.
 
     Raises what `best_response` and `leader_gradient` raise.
     """
@@ -99,33 +130,36 @@ def plan_stackelberg(
     low, high = limits(robot_bounds, start)
     answer, solves = vector("u_human_init", u_human_init), 0
     best: tuple[float, Tensor, Tensor, np.ndarray] | None = None
+    added = 0.0
 
-    def value_at(u_robot: Tensor) -> float:
+    def respond(u_robot: Tensor) -> Tensor:
         nonlocal answer, solves
         answer = best_response(
-            reward_human, u_robot, answer, bounds=bounds, tolerance=response_tolerance, followers=followers
-        )
+            reward_human, u_robot, answer, bounds=bounds, tolerance=response_tolerance, ridge=ridge,
+            followers=followers, derivatives=derivatives,
+        )  # fmt: skip
         solves += 1
-        return float(reward_robot(u_robot, answer))
+        return answer
 
     def differences(u_robot: Tensor) -> Tensor:
         steps = difference * torch.eye(len(u_robot), dtype=torch.float64)
-        ends = [value_at(u_robot + step) - value_at(u_robot - step) for step in steps]
-        return torch.tensor(ends, dtype=torch.float64) / (2.0 * difference)
+        ends = [[float(reward_robot(u, respond(u))) for u in (u_robot + step, u_robot - step)] for step in steps]
+        return (torch.tensor(ends, dtype=torch.float64) @ torch.tensor([1.0, -1.0]).double()) / (2.0 * difference)
 
     width = high - low
     unit = torch.where(torch.isfinite(width) & (width > 0.0), width, 1.0).numpy()
 
     def loss(z: np.ndarray) -> tuple[float, np.ndarray]:
-        nonlocal best
+        nonlocal best, added
         u_robot = torch.clamp(torch.from_numpy(z * unit), low, high)
-        value, here = value_at(u_robot), answer
+        here = respond(u_robot)
         if difference:
-            slope = differences(u_robot)
+            value, slope = float(reward_robot(u_robot, here)), differences(u_robot)
         else:
-            slope = leader_gradient(
-                reward_robot, reward_human, u_robot, here, bounds=bounds, ridge=ridge, followers=followers
+            value, slope, ridge_here = _gradient_and_ridge(
+                reward_robot, reward_human, u_robot, here, bounds, ridge, followers, derivatives
             )
+            added = max(added, ridge_here)
         if best is None or value > best[0]:
             best = value, u_robot, here, slope.numpy()
         return -value, -slope.numpy() * unit
@@ -145,4 +179,5 @@ def plan_stackelberg(
         converged=bool(np.abs(pushed).max(initial=0.0) <= max(tolerance, 1e-5 * (1.0 + abs(value)))),
         human_solves=solves,
         status=str(found.message),
+        ridge=added,
     )

@@ -1,4 +1,4 @@
-"""Robots among people: episodes of a driving scene, recorded, and what they add up to."""
+"""Robots among people: episodes of a scene, recorded, and what they add up to."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -11,20 +11,20 @@ import numpy as np
 from scipy.stats import t as student
 
 from lfd.core.artifact import new_folder, write_json, write_manifest
-from lfd.core.errors import InputError
+from lfd.core.errors import InputError, UnknownName
 from lfd.core.protocols import Observation, Observer, Progress, Transition, World, silent
-from lfd.interaction.driving_people import BoltzmannDriver, type_of
-from lfd.interaction.driving_robots import DriverOptions, InteractiveDriver
+from lfd.interaction.scenes import InteractionScene, RobotOptions, scene_of
 from lfd.record.episode_file import McapRecorder, Origin
 from lfd.record.mcap_file import SUFFIX
 from lfd.run.wilson import wilson_interval
-from lfd.worlds.driving_world import PERSON, DrivingWorld, load_scene, seen_cars
 from lfd.worlds.rollout import episode_rng, rollout
 
 STAGE = "eval"
 CERTAIN = 0.9
 """Probability of the person's true type that counts as certainty."""
 REPORT, PICTURE = "report.json", "entropy.png"
+FARTHEST_M = 30.0
+"""Along the way, beyond which the picture shows nothing [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +32,10 @@ class InteractRecipe:
     """Which scene, people and robots."""
 
     scene: str
-    """merge or crossing."""
-    robots: tuple[DriverOptions, ...]
+    """One of `lfd.interaction.scenes`."""
+    robots: tuple[RobotOptions, ...]
     person: str
-    """passive, aggressive or random."""
+    """Who is met: one of the scene's people, such as random."""
     episodes: int
     """Episodes of each robot; number i begins alike for all of them."""
     seed: int
@@ -50,7 +50,9 @@ class InteractRecipe:
 
     def check(self) -> None:
         """Raise `InputError` for numbers out of range, or a robot that is given twice."""
-        load_scene(self.scene)
+        scene = scene_of(self.scene)
+        if self.person not in scene.people:
+            raise UnknownName("person", self.person, scene.people)
         for name in ("episodes", "control_hz", "max_seconds", "hold_seconds"):
             if getattr(self, name) <= 0:
                 raise InputError(f"{name} = {getattr(self, name)}: must be greater than 0")
@@ -75,7 +77,7 @@ class Trial:
     """Time until the robot was where it should be [s]; the longest where it never was."""
     collided: bool
     least_distance: float
-    """Smallest distance between the outlines [m]."""
+    """Smallest distance between the surfaces [m]."""
     certain_s: float | None
     """When the belief was first certain of the person's type [s]; the longest where it never was."""
     entropy: tuple[float, ...]
@@ -91,7 +93,8 @@ class Trial:
 class _Watch:
     """Collects what a trial is made of."""
 
-    def __init__(self) -> None:
+    def __init__(self, scene: InteractionScene) -> None:
+        self._scene = scene
         self.distances: list[float] = []
         self.offsets: list[tuple[float, float]] = []
         self.beliefs: list[Mapping[str, float]] = []
@@ -99,7 +102,7 @@ class _Watch:
         self.failure = ""
 
     def begin(self, world: World, observation: Observation) -> None:
-        self.person = type_of(world.get_state().memory["theta"])
+        self.person = self._scene.type_of(world.get_state().memory["theta"])
         self._see(observation)
 
     def step(self, world: World, transition: Transition) -> None:
@@ -117,25 +120,24 @@ class _Watch:
         """Nothing to undo."""
 
     def _see(self, observation: Observation) -> None:
-        robot, person = seen_cars(observation)
-        self.offsets.append((robot.x - person.x, robot.y - person.y))
-        self.distances.append(float(observation[f"{PERSON}_distance"][0]))
+        self.offsets.append(self._scene.offset(observation))
+        self.distances.append(self._scene.distance(observation))
 
 
-def label(robot: DriverOptions) -> str:
+def label(robot: RobotOptions) -> str:
     """What a robot is called in reports: its kind, and whom it takes people for."""
     return f"known-{robot.assumed}" if robot.kind == "known" else robot.kind
 
 
-def run_trial(recipe: InteractRecipe, robot: DriverOptions, index: int, observers: Sequence[Observer] = ()) -> Trial:
+def run_trial(recipe: InteractRecipe, robot: RobotOptions, index: int, observers: Sequence[Observer] = ()) -> Trial:
     """Episode `index` of a robot."""
-    scene = load_scene(recipe.scene)
-    world = DrivingWorld(scene, BoltzmannDriver(scene, recipe.person, recipe.rationality), recipe.control_hz)
-    driver, watch = InteractiveDriver(scene, recipe.control_hz, robot), _Watch()
+    scene = scene_of(recipe.scene)
+    world = scene.world(recipe.person, recipe.control_hz, recipe.rationality)
+    policy, watch = scene.robot(recipe.control_hz, robot), _Watch(scene)
     hold = max(1, round(recipe.hold_seconds * recipe.control_hz))
     outcome = rollout(
         world,
-        driver,
+        policy,
         [watch, *observers],
         episode_rng(STAGE, recipe.seed, index),
         horizon=round(recipe.max_seconds * recipe.control_hz),
@@ -152,17 +154,23 @@ def run_trial(recipe: InteractRecipe, robot: DriverOptions, index: int, observer
         certain_s=(certain[0] / recipe.control_hz if certain else recipe.max_seconds) if watch.beliefs else None,
         entropy=tuple(watch.entropy),
         offsets=tuple(watch.offsets),
-        plan_ms=1e3 * float(np.median(driver.planner.seconds)),
-        solves=float(np.mean(driver.planner.solves)),
+        plan_ms=1e3 * float(np.median(policy.planner.seconds)),
+        solves=float(np.mean(policy.planner.solves)),
     )
 
 
 def interact(
-    recipe: InteractRecipe, out: Path, *, overwrite: bool = False, progress: Progress = silent
+    recipe: InteractRecipe,
+    out: Path,
+    *,
+    parents: Mapping[str, str] | None = None,
+    overwrite: bool = False,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Run all robots; recordings land in a folder for each, beside the report and a picture. Returns the report.
 
-    Raises what `InteractRecipe.check` raises, `OutputError` when `out` exists.
+    `parents` are what the robots' rewards were read from, with their hashes. Raises what `InteractRecipe.check` raises,
+    `OutputError` when `out` exists.
     """
     recipe.check()
     tables = {"interact": json.loads(json.dumps(asdict(recipe)))}
@@ -183,7 +191,7 @@ def interact(
         rows = {name: [asdict(trial) for trial in of] for name, of in trials.items()}
         write_json(part / REPORT, {"robots": report, "trials": rows})
         (part / PICTURE).write_bytes(picture(trials, recipe.control_hz))
-        write_manifest(part, kind="interaction", recipe=tables, parents={}, seed=recipe.seed)
+        write_manifest(part, kind="interaction", recipe=tables, parents=parents or {}, seed=recipe.seed)
     return report
 
 
@@ -251,10 +259,12 @@ def picture(trials: Mapping[str, Sequence[Trial]], control_hz: int) -> bytes:
         error = 1.96 * rows.std(axis=0) / np.sqrt(len(rows))
         left.plot(times, mean, color=colour, label=name)
         left.fill_between(times, mean - error, mean + error, color=colour, alpha=0.15, linewidth=0)
-    left.axhline(np.log(2.0), color="0.6", linestyle=":", label="nothing known")
-    left.set(xlabel="time [s]", ylabel="entropy of the belief [nat]", ylim=(-0.02, 0.75))
+    unknown = max((trial.entropy[0] for of in trials.values() for trial in of if trial.entropy), default=np.log(2.0))
+    left.axhline(unknown, color="0.6", linestyle=":", label="nothing known")
+    left.set(xlabel="time [s]", ylabel="entropy of the belief [nat]", ylim=(-0.02, 1.08 * unknown))
     right.plot(0.0, 0.0, "ks", markersize=7)
-    right.set(xlabel="x from the person [m]", ylabel="y from the person [m]", title="first episode", xlim=(-30.0, 30.0))
+    far = min(FARTHEST_M, 1.1 * max(abs(x) for of in trials.values() for x, _ in of[0].offsets))
+    right.set(xlabel="x from the person [m]", ylabel="y from the person [m]", title="first episode", xlim=(-far, far))
     for axes in (left, right):
         axes.grid(alpha=0.3)
         axes.legend(frameon=False, fontsize="small")

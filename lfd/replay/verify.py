@@ -11,9 +11,8 @@ from lfd.core.errors import RecordingError
 from lfd.core.protocols import Observation, Policy, Transition, World, WorldState
 from lfd.experts.playback import PlaybackPolicy
 from lfd.experts.pushing import PushedArm, RecordedPerson
-from lfd.interaction.driving_people import BoltzmannDriver
+from lfd.interaction.scenes import SCENES
 from lfd.record.episode_file import read_episode, recording_in
-from lfd.worlds.driving_world import SCENES, DrivingWorld, load_scene
 from lfd.worlds.robosuite_world import RobosuiteWorld, make_world
 from lfd.worlds.rollout import rollout
 
@@ -96,9 +95,7 @@ def _world_of(episode: Episode) -> World:
     """The world that an episode was recorded in."""
     about = episode.metadata
     if about.task in SCENES:
-        scene = load_scene(about.task)
-        people = BoltzmannDriver(scene, "random", about.recipe["interact"]["rationality"])
-        return DrivingWorld(scene, people, about.control_hz)
+        return SCENES[about.task].world("random", about.control_hz, about.recipe["interact"]["rationality"])
     return make_world(about.task, about.robot, about.control_hz, about.stepper, controller=about.controller)
 
 

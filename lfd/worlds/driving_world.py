@@ -1,4 +1,5 @@
-"""Two cars on a road: a robot, and a person who answers to what it does (the highway merge of chapter 10.6).
+"""Cars on a road: a robot, and a person who answers to what it does (the highway merge of chapter 10.6). Where the lane
+is dense, a second car follows the person's, by `lfd.worlds.car_following`.
 
 Cars are bicycles of the rear axle, one Euler step for each control step of dt:
 
@@ -9,8 +10,9 @@ MuJoCo holds and draws the state, nothing is simulated with it: a car's joints a
 its wheels, whose rate is v / radius. Thus a recording has a model and states of the same kind as an arm's.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Protocol
 
 import mujoco
@@ -19,6 +21,7 @@ from jaxtyping import Float, UInt8
 
 from lfd.core.errors import InputError, SimulationError, UnknownName
 from lfd.core.protocols import Observation, StepResult, WorldSpec, WorldState
+from lfd.worlds.car_following import CarFollowing
 
 LENGTH, WIDTH, WHEELBASE, RADIUS = 4.5, 1.8, 2.7, 0.33
 """Of a car and of its wheels [m]; its middle is half a wheelbase before the rear axle."""
@@ -26,7 +29,7 @@ LANE = 3.5
 """Width of a lane [m]."""
 ACTION_LOW, ACTION_HIGH = np.array([-5.0, -0.06]), np.array([3.0, 0.06])
 """Limits of the robot's acceleration [m/s^2] and steering angle [rad]."""
-ROBOT, PERSON = "robot_car", "person_car"
+ROBOT, PERSON, SECOND = CARS = "robot_car", "person_car", "second_car"
 JOINTS = ("x", "y", "yaw", "steering", "wheels")
 INTEGRATION = mujoco.mjtState.mjSTATE_INTEGRATION
 
@@ -77,7 +80,7 @@ class Person(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class DrivingScene:
-    """A road, and where two cars begin on it. The robot is to drive along y = 0, in the direction of x."""
+    """A road, and where cars begin on it. The robot is to drive along y = 0, in the direction of x."""
 
     name: str
     instruction: str
@@ -96,22 +99,37 @@ class DrivingScene:
     passed: float | None
     """x that the robot must pass to be done [m]; where there is none, it must be in its lane, `clearance` off."""
     clearance: float = 2.0
-    """Distance from the other car's outline that a lane change must keep in the end [m]."""
+    """Distance from the others' outlines that a lane change must keep in the end [m]."""
+    second: CarFollowing | None = None
+    """Who follows the person; None for a lane without a second car. It begins as far off as it settles at."""
 
-    def is_done(self, robot: Car, person: Car) -> bool:
+    @property
+    def cars(self) -> tuple[str, ...]:
+        """Names of the cars, the robot's first."""
+        return CARS if self.second else CARS[:2]
+
+    @property
+    def in_the_way(self) -> float:
+        """How far beside the person's path the robot's middle is when it begins to be on it: half of both cars, as they
+        face each other [m]."""
+        across = abs(np.sin(self.heading)) * LENGTH + abs(np.cos(self.heading)) * WIDTH
+        return float(across + WIDTH) / 2.0
+
+    def is_done(self, robot: Car, *others: Car) -> bool:
         """Whether the robot is where it should be."""
         if self.passed is not None:
             return bool(robot.x - (LENGTH - WHEELBASE) / 2.0 > self.passed)
         in_lane = abs(robot.y) < 0.5 and abs(robot.yaw) < 0.1
-        return bool(in_lane and separation(robot, person) >= self.clearance)
+        return bool(in_lane and min(separation(robot, other) for other in others) >= self.clearance)
 
 
 SCENES = {
     scene.name: scene
     for scene in (
         DrivingScene(
-            name="merge", instruction="change to the left lane, before or behind the other car", heading=0.0,
+            name="merge", instruction="change to the left lane, before or behind the other cars", heading=0.0,
             robot_y=-LANE, robot_x=(3.0, 9.0), person_start=(0.0, 0.0), speeds=(14.0, 16.0), cruise=15.0, passed=None,
+            second=CarFollowing(),
         ),
         DrivingScene(
             name="crossing", instruction="go straight on over the crossing", heading=np.pi / 2.0,
@@ -153,9 +171,9 @@ def _from_sides(points: Float[np.ndarray, "4 2"], corners: Float[np.ndarray, "4 
 
 
 class DrivingWorld:
-    """A scene with a robot's car and a person's.
+    """A scene with a robot's car, a person's, and a second one where the scene has it.
 
-    The action is the acceleration [m/s^2] and the steering angle [rad]. An episode breaks off when the cars touch. The
+    The action is the acceleration [m/s^2] and the steering angle [rad]. An episode breaks off when cars touch. The
     person's theta and the seed of their draws are in the world's memory, not in what it shows.
     """
 
@@ -176,10 +194,10 @@ class DrivingWorld:
             control_hz=control_hz,
             labels={
                 **{f"joint_{kind}": tuple(joints) for kind in ("pos", "vel", "effort")},
-                **{f"{car}_pos": ("x", "y", "z") for car in (ROBOT, PERSON)},
-                **{f"{car}_quat": ("w", "x", "y", "z") for car in (ROBOT, PERSON)},
-                **{f"{car}_speed": ("speed",) for car in (ROBOT, PERSON)},
-                f"{PERSON}_distance": ("distance",),
+                **{f"{car}_pos": ("x", "y", "z") for car in scene.cars},
+                **{f"{car}_quat": ("w", "x", "y", "z") for car in scene.cars},
+                **{f"{car}_speed": ("speed",) for car in scene.cars},
+                **{f"{car}_distance": ("distance",) for car in scene.cars[1:]},
                 "action": ("acceleration", "steering"),
             },
             action_low=ACTION_LOW.copy(),
@@ -198,7 +216,11 @@ class DrivingWorld:
         person = Car(along * np.cos(heading), along * np.sin(heading), heading, speeds[1])
         self._seed, self._theta = int(rng.integers(2**31)), self._person.draw(rng)
         mujoco.mj_resetData(self._model, self._data)
-        self._put(robot, 0.0, person)
+        cars = [robot, person]
+        if scene.second:
+            back = LENGTH + scene.second.settled_gap(person.speed)
+            cars.append(Car(person.x - back * np.cos(heading), person.y - back * np.sin(heading), heading, speeds[1]))
+        self._put(cars, 0.0)
         return self._observe()
 
     def step(self, action: Float[np.ndarray, "Da"]) -> StepResult:
@@ -209,16 +231,16 @@ class DrivingWorld:
         if action.shape != (2,) or not np.isfinite(action).all():
             raise InputError(f"the action is {action}; give a finite acceleration and steering angle")
         applied = np.clip(action, ACTION_LOW, ACTION_HIGH)
-        robot, person = self._car(0), self._car(1)
+        robot, person, *rest = cars = self._cars()
         number = round(self._data.time / self._dt)
         draw = np.random.default_rng([self._seed, number]).random()
         acceleration = self._person.answer(self._theta, robot, person, applied, draw)
-        robot = robot.moved(float(applied[0]), float(applied[1]), self._dt)
-        person = person.moved(acceleration, 0.0, self._dt)
+        cars = [robot.moved(float(applied[0]), float(applied[1]), self._dt), person.moved(acceleration, 0.0, self._dt)]
+        cars += [car.moved(self._following(car, person, robot), 0.0, self._dt) for car in rest]
         self._data.time = (number + 1) * self._dt
-        self._put(robot, applied[1], person)
-        touched = separation(robot, person) == 0.0
-        done = self._scene.is_done(robot, person) and not touched
+        self._put(cars, applied[1])
+        touched = min(separation(a, b) for a, b in combinations(cars, 2)) == 0.0
+        done = self._scene.is_done(*cars) and not touched
         failure = f"the cars touched after t = {self._data.time:.2f} s" if touched else ""
         return StepResult(self._observe(), -self._dt * (not done), done, bool((applied != action).any()), failure)
 
@@ -233,7 +255,7 @@ class DrivingWorld:
         return {}
 
     def get_state(self) -> WorldState:
-        """Both cars, the person's theta, and the seed of their draws."""
+        """The cars, the person's theta, and the seed of their draws."""
         memory = {"theta": np.array(self._theta, dtype=float), "seed": np.array(float(self._seed))}
         return WorldState(model_xml=self._xml, sim=self.sim_state(), memory=memory)
 
@@ -245,36 +267,58 @@ class DrivingWorld:
         self._theta, self._seed = np.array(state.memory["theta"], dtype=float), int(state.memory["seed"])
         return self._observe()
 
-    def _car(self, number: int) -> Car:
-        at = len(JOINTS) * number
-        x, y, yaw = self._data.qpos[at : at + 3].tolist()
-        return Car(x, y, yaw, float(self._data.qvel[at + 4]) * RADIUS)
+    def _following(self, second: Car, person: Car, robot: Car) -> float:
+        """The second car's acceleration: it follows the person, and the robot once its middle is in the lane."""
+        assert self._scene.second is not None
+        c, s = np.cos(second.yaw), np.sin(second.yaw)
+        found = []
+        for ahead in (person, robot):
+            dx, dy = ahead.x - second.x, ahead.y - second.y
+            if dx * c + dy * s > 0.0 and abs(dy * c - dx * s) < LANE / 2.0:
+                gap = dx * c + dy * s - LENGTH
+                found.append(self._scene.second.acceleration(gap, second.speed, ahead.speed))
+        return min(found)
 
-    def _put(self, robot: Car, steering: float, person: Car) -> None:
-        """Set both cars; wheels have rolled on for a step at their last rate."""
-        qpos, qvel = self._data.qpos.reshape(2, -1), self._data.qvel.reshape(2, -1)
+    def _cars(self) -> list[Car]:
+        rows = zip(self._data.qpos.reshape(-1, len(JOINTS)), self._data.qvel.reshape(-1, len(JOINTS)), strict=True)
+        return [Car(float(at[0]), float(at[1]), float(at[2]), float(rate[4]) * RADIUS) for at, rate in rows]
+
+    def _put(self, cars: Sequence[Car], steering: float) -> None:
+        """Set the cars, only the robot steers; wheels have rolled on for a step at their last rate."""
+        qpos, qvel = self._data.qpos.reshape(len(cars), -1), self._data.qvel.reshape(len(cars), -1)
         qpos[:, 4] += qvel[:, 4] * self._dt
-        for row, (car, angle) in enumerate(((robot, steering), (person, 0.0))):
+        for row, car in enumerate(cars):
+            angle = steering if row == 0 else 0.0
             qpos[row, :4] = car.x, car.y, car.yaw, angle
             turn = car.speed * np.tan(angle) / WHEELBASE
             qvel[row] = car.speed * np.cos(car.yaw), car.speed * np.sin(car.yaw), turn, 0.0, car.speed / RADIUS
 
     def _observe(self) -> Observation:
-        cars = {ROBOT: self._car(0), PERSON: self._car(1)}
+        cars = dict(zip(self._scene.cars, self._cars(), strict=True))
         seen = {"joint_pos": self._data.qpos[3:5].copy(), "joint_vel": self._data.qvel[3:5].copy()}
         seen["joint_effort"] = np.zeros(2)  # kinematic cars know no torques
         for name, car in cars.items():
             seen[f"{name}_pos"] = np.array([car.x, car.y, 0.0])
             seen[f"{name}_quat"] = np.array([np.cos(car.yaw / 2.0), 0.0, 0.0, np.sin(car.yaw / 2.0)])
             seen[f"{name}_speed"] = np.array([car.speed])
-        seen[f"{PERSON}_distance"] = np.array([separation(cars[ROBOT], cars[PERSON])])
+        for name in self._scene.cars[1:]:
+            seen[f"{name}_distance"] = np.array([separation(cars[ROBOT], cars[name])])
         return seen
 
 
 def seen_cars(observation: Observation) -> tuple[Car, Car]:
     """The robot's car and the person's, as observed."""
-    robot, person = (_seen(observation, name) for name in (ROBOT, PERSON))
-    return robot, person
+    return _seen(observation, ROBOT), _seen(observation, PERSON)
+
+
+def seen_second(observation: Observation) -> Car | None:
+    """The second car as observed, if there is one."""
+    return _seen(observation, SECOND) if f"{SECOND}_pos" in observation else None
+
+
+def least_distance(observation: Observation) -> float:
+    """Distance from the robot's outline to the nearest other one [m]."""
+    return min(float(observation[name][0]) for name in (f"{car}_distance" for car in CARS) if name in observation)
 
 
 def _seen(observation: Observation, name: str) -> Car:
@@ -284,7 +328,7 @@ def _seen(observation: Observation, name: str) -> Car:
 
 
 def _model_xml(scene: DrivingScene) -> str:
-    """The road, two lanes along x or a crossing, and two cars."""
+    """The road, two lanes along x or a crossing, and the cars."""
     roads = [_box("road_x", (150.0, 0.0 if scene.passed else -LANE / 2.0, -0.06), (250.0, LANE, 0.05), "0.4 0.4 0.4 1")]
     if scene.passed is None:
         marks = [
@@ -293,7 +337,8 @@ def _model_xml(scene: DrivingScene) -> str:
     else:
         roads.append(_box("road_y", (0.0, 0.0, -0.07), (LANE, 100.0, 0.05), "0.4 0.4 0.4 1"))
         marks = [_box("stop_line", (-LANE - 0.3, -LANE / 4.0, -0.01), (0.15, LANE / 4.0, 0.005), "1 1 1 1")]
-    cars = _car_xml(ROBOT, "0.16 0.42 0.85 1") + _car_xml(PERSON, "0.92 0.35 0.05 1")
+    colours = "0.16 0.42 0.85 1", "0.92 0.35 0.05 1", "0.55 0.57 0.6 1"
+    cars = "".join(_car_xml(name, colour) for name, colour in zip(scene.cars, colours, strict=False))
     return (
         f'<mujoco model="{scene.name}"><option gravity="0 0 0"/>'
         '<default><geom contype="0" conaffinity="0" group="1"/></default>'
