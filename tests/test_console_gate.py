@@ -172,6 +172,17 @@ def test_a_page_is_told_its_name_that_it_drives_and_its_keys(server) -> None:
     seats.pass_on("one")
 
 
+def test_events_before_a_pause_of_the_arm_say_nothing_of_latency() -> None:
+    seats, port = Seats(), free_port()
+    channel = InputChannel(seats, lambda _seat, _tab: None)
+    with page_server("127.0.0.1", port, Gate(TOKEN, port), channel.serve), page(port) as connection:
+        connection.send(json.dumps({"hello": {"tab": "one", "seat": "s"}}))
+        connection.recv(5)
+        for number, told in ((1, {"n": 1, "paused": True}), (2, {"n": 2})):
+            channel.taken(number)
+            assert json.loads(connection.recv(5)) == told
+
+
 def test_a_port_in_use_is_told_before_anything_is_served(server) -> None:
     port, _ = server
 

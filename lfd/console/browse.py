@@ -50,7 +50,7 @@ def add_browse(page: Page) -> None:
 
     def show() -> None:
         place = path()
-        facts.content = card_of(place)
+        facts.content = card_of(place, page.folder.path)
         found = sorted(place.glob("*.png"))[: len(pictures)]
         for picture, file in zip(pictures, [*found, *[None] * len(pictures)], strict=False):
             picture.visible = file is not None
@@ -77,8 +77,8 @@ def add_browse(page: Page) -> None:
     refresh()
 
 
-def card_of(place: Path) -> str:
-    """What a folder holds and where it comes from, as HTML."""
+def card_of(place: Path, folder: Path) -> str:
+    """What a place below a folder holds and where it comes from, as HTML."""
     rows = [(key, value) for key, value in about(place).items() if not isinstance(value, (Mapping, list))]
     table = "".join(
         f"<tr><td style='opacity:0.7;padding-right:0.75em'>{text(str(key))}</td><td>{text(str(value))}</td></tr>"
@@ -86,7 +86,7 @@ def card_of(place: Path) -> str:
     )
     file = place / CARD
     card = f"<b>card</b>{_plain(file.read_text(encoding='utf-8')[:LONGEST_CARD])}" if file.is_file() else ""
-    chain = _plain("\n".join(lines_of(trace(place))))
+    chain = _plain("\n".join(lines_of(trace(place))).replace(f"{folder}/", ""))
     return block("card", f"<table>{table}</table><b>comes from</b>{chain}{card}", "font-size:0.85em")
 
 

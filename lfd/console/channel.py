@@ -19,6 +19,8 @@ from lfd.experts.keys import MOVES, WORDS
 
 MOST_PER_S = 250
 """Messages of a page in a second; it sends about fifty, and one more for each event."""
+PAUSE_S = 1.0
+"""Time without a control step after which an event was not meant for a moving arm, and says nothing of latency [s]."""
 REFUSED = 1008
 """WebSocket's code for a message that breaks the rules."""
 KNOWN = sorted({key for key in (*MOVES, *WORDS) if key.isprintable()} | {"Enter", "ArrowUp", "ArrowDown"})
@@ -32,13 +34,15 @@ class InputChannel:
         """`seated` is told the name of the scene's connection and the tab of the same page."""
         self._seats, self._seated = seats, seated
         self._links: dict[str, _Link] = {}
+        self._read = 0.0
         seats.on_change(self._tell_all)
 
     def taken(self, number: int) -> None:
         """Tell the driver that a control step has taken in their message; from any thread."""
-        link = self._links.get(self._seats.driver)
+        link, now = self._links.get(self._seats.driver), time.monotonic()
+        paused, self._read = now - self._read > PAUSE_S, now
         if link is not None:
-            link.send({"n": number})
+            link.send({"n": number, "paused": True} if paused else {"n": number})
 
     async def serve(self, connection: ServerConnection) -> None:
         """One connection, until it ends."""

@@ -23,7 +23,10 @@
       socket.onmessage = (message) => {
         const told = JSON.parse(message.data);
         if (told.n !== undefined) {
-          for (const [n, at] of events) if (n <= told.n) { late.push(now() - at); events.delete(n); }
+          for (const [n, at] of events) if (n <= told.n) {
+            events.delete(n);
+            if (!told.paused) late.push(now() - at); // else the arm stood, and nobody waited for it
+          }
         }
         if (told.tab !== undefined) hello.tab = told.tab;
         if (told.drives !== undefined) { drives = told.drives; events.clear(); }

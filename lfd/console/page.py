@@ -62,6 +62,7 @@ class Page:
     @contextmanager
     def progress(self, label: str, total: int) -> Iterator["_Bar"]:
         """A bar of the page; `lfd.core.protocols.Progress`. Its work can be stopped."""
+        self.tell(self.stage.doing, label)
         bar = _Bar(self, label, total)
         self._bar.visible = True
         try:

@@ -24,6 +24,7 @@ from lfd.loops.watching import trial_of, watch
 from lfd.worlds.robots import load_teleop
 
 NONE = "none yet"
+FIRST = "dagger_lift"
 WORDS = (Word.START, Word.TAKE_OVER, Word.HAND_BACK, Word.GRIPPER, Word.SUCCESS, Word.FAILURE, Word.DISCARD, Word.QUIT)
 HELP = """\
 The learner acts. Take over by moving (keys, gamepad, gizmo)
@@ -35,14 +36,14 @@ def add_supervise(page: Page) -> None:
     gui, learn_in, data_in = page.gui, page.recipes / "policies", page.recipes / "datasets"
     gui.add_html(hint(HELP))
     policies, data = recipes(learn_in, "dagger"), recipes(data_in, "record")
-    recipe = gui.add_dropdown("learner", policies)
+    recipe = gui.add_dropdown("learner", policies, initial_value=FIRST if FIRST in policies else policies[0])
     source = gui.add_dropdown("task", data, initial_value="lift_panda" if "lift_panda" in data else data[0])
     rounds = gui.add_number("rounds", 3, min=2, max=100, step=1)
     rollouts = gui.add_number("rollouts a round", 5, min=1, max=1000, step=1)
     seconds = gui.add_number("longest [s]", 20.0, min=1.0, max=600.0, step=1.0, hint="of a rollout")
     demonstrations = gui.add_number("demonstrations at first", 10, min=1, max=1000, step=1)
     trials = gui.add_number("trials a round", 10, min=1, max=1000, step=1, hint="by which success is measured")
-    steps = gui.add_number("gradient steps", 2000, min=1, max=1_000_000, step=1)
+    steps = gui.add_number("gradient steps", 2000, min=1, max=1_000_000, step=1, hint="of each round")
     mine = gui.add_checkbox("I demonstrate", False, hint="else the scripted expert gives the demonstrations")
     name = gui.add_text("save as", "supervised")
     curve = success_plot(page)
@@ -56,6 +57,9 @@ def add_supervise(page: Page) -> None:
             "rollout_seconds": float(seconds.value),
             "demonstrations": int(demonstrations.value),
             "gate": HUMAN,
+            "warm_steps": int(steps.value),
+            "last_steps": 0,
+            "evaluate": "every",
         }
         learn["train"] |= {"steps": int(steps.value)}
         learn["eval"] |= {"episodes": int(trials.value)}
