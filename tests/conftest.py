@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,6 +52,15 @@ BC = ROOT / "policies" / "bc_mlp.toml"
 @pytest.fixture(autouse=True)
 def _in_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
+
+
+@pytest.fixture(autouse=True)
+def _ordinary_priority() -> Iterator[None]:
+    """LeRobot's encoder leaves the process of a test with real-time priority, and browsers beside it stand still."""
+    from lfd.core.processes import ordinary_priority
+
+    yield
+    ordinary_priority()
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,10 @@
 """Pictures in datasets: as videos, which LeRobot decodes, and without loss."""
 
+import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -246,3 +248,18 @@ def test_the_same_pictures_make_the_same_bytes(codec) -> None:
     pictures = [np.clip(noise.normal(128 + 4 * t, 20, (64, 96, 3)), 0, 255).astype(np.uint8) for t in range(30)]
     made = {encode_video(pictures, 20, VideoRecipe(codec=codec), "a") for _ in range(60 if codec == "h264" else 5)}
     assert len(made) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="libsvtav1 asks for real-time priority on Linux")
+def test_an_encoder_does_not_keep_the_machine_to_itself() -> None:
+    """It takes real-time priority as root, for its threads and for its caller, for good."""
+    seen: list[set[int]] = []
+
+    def pictures() -> Iterator[np.ndarray]:
+        for value in range(3):
+            seen.append({os.sched_getscheduler(int(task.name)) for task in Path("/proc/self/task").iterdir()})
+            yield np.full((64, 64, 3), value, np.uint8)
+
+    encode_video(pictures(), FPS, VideoRecipe(codec="libsvtav1"), "episode 0")
+    assert set().union(*seen[1:]) == {os.SCHED_OTHER}
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER

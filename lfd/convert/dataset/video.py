@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lfd.core.errors import DatasetError, RecipeError, UnknownName
+from lfd.core.processes import ordinary_priority
 
 PNG = "png"
 CODECS = ("libsvtav1", "h264", "hevc")
@@ -59,7 +60,7 @@ def encode_video(pictures: Iterable[UInt8[np.ndarray, "H W 3"]], fps: int, recip
     from av.error import FFmpegError
 
     os.environ.setdefault("SVT_LOG", "1")  # else libsvtav1 tells its settings for every video
-    file, size = io.BytesIO(), (0, 0)
+    file, size, started = io.BytesIO(), (0, 0), False
     try:
         with av.open(file, "w", format="mp4") as output:
             stream: Any = None
@@ -69,7 +70,11 @@ def encode_video(pictures: Iterable[UInt8[np.ndarray, "H W 3"]], fps: int, recip
                     stream = output.add_stream(recipe.codec, fps, options=recipe.options)
                     stream.height, stream.width = size
                     stream.pix_fmt = "yuv420p"
-                output.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")))
+                packets = stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24"))
+                if not started:  # the first picture starts the encoder's threads
+                    started = True
+                    ordinary_priority()
+                output.mux(packets)
             output.mux(stream.encode())
     except FFmpegError as error:
         raise DatasetError(
