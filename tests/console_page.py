@@ -58,9 +58,13 @@ class Driver:
     def __init__(self, page: Page, url: str):
         self.page = page
         page.set_default_timeout(PATIENCE_MS)
-        page.goto(url)
-        page.wait_for_selector("[data-lfd-status]")
-        page.get_by_text("Software WebGL rendering").locator("xpath=../../..//button").first.click()  # it hides the arm
+        self.arrive(url)
+
+    def arrive(self, url: str) -> None:
+        """Open the page, and put away what hides the arm."""
+        self.page.goto(url)
+        self.page.wait_for_selector("[data-lfd-status]")
+        self.page.get_by_text("Software WebGL rendering").locator("xpath=../../..//button").first.click()
 
     def told(self) -> str:
         """What the page says of what goes on."""

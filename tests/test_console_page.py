@@ -95,7 +95,7 @@ def test_a_dropped_connection_stops_the_arm_and_a_reloaded_page_goes_on(console,
     stood = hand.position.copy()
     driver.page.wait_for_timeout(1000)
     np.testing.assert_array_equal(hand.position, stood)
-    driver.page.goto(console.url)
+    driver.arrive(console.url)
     driver.drives()
     driver.wait_for("episode 0: moving")
     driver.page.wait_for_timeout(500)
