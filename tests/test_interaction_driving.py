@@ -15,7 +15,8 @@ from lfd.interaction.driving_model import (
     person_reward,
 )
 from lfd.interaction.driving_people import ACCELERATIONS, LOOK_AHEAD, BoltzmannDriver, choices_now, type_of
-from lfd.interaction.driving_robots import KINDS, DriverOptions, InteractiveDriver
+from lfd.interaction.driving_robots import DriverOptions, InteractiveDriver
+from lfd.interaction.interactive_robot import KINDS
 from lfd.interaction.receding_horizon import Limits, RecedingHorizon, shifted
 from lfd.interaction.responses import best_response
 from lfd.interaction.stackelberg import leader_gradient, plan_stackelberg

@@ -5,7 +5,8 @@ import pytest
 
 from lfd.cli import main
 from lfd.core.errors import InputError
-from lfd.interaction.scenes import SCENES, Robot, RobotOptions, scene_of
+from lfd.interaction.interactive_robot import InteractiveRobot, RobotOptions
+from lfd.interaction.scenes import SCENES, scene_of
 from lfd.loops.interacting import InteractRecipe, run_trial
 from lfd.record.episode_file import read_episode
 from lfd.replay.clip import clip_of
@@ -65,7 +66,7 @@ def test_a_scene_has_robots_of_all_kinds_for_its_types(name) -> None:
     for options in robots:
         options.check()
         assert isinstance(options, RobotOptions)
-        assert isinstance(scene.robot(5, options), Robot)
+        assert isinstance(scene.robot(5, options), InteractiveRobot)
 
 
 def test_what_a_scene_does_not_have_is_refused(lfd_fails, tmp_path) -> None:

@@ -4,6 +4,7 @@ import torch
 from torch.func import hessian, jacrev
 
 from lfd.core.errors import InputError, UnknownName
+from lfd.interaction.interactive_robot import KINDS
 from lfd.interaction.responses import best_response
 from lfd.interaction.stackelberg import leader_gradient
 from lfd.interaction.table_model import (
@@ -20,7 +21,7 @@ from lfd.interaction.table_model import (
     reach_now,
 )
 from lfd.interaction.table_people import LOOK_AHEAD, VELOCITIES, BoltzmannHand, choices_now, type_of
-from lfd.interaction.table_robots import KINDS, InteractiveReacher, ReacherOptions
+from lfd.interaction.table_robots import InteractiveReacher, ReacherOptions
 from lfd.worlds.shared_table import HAND_HIGH, HAND_HOME, HAND_LOW, Table
 from lfd.worlds.shared_table_guard import BALL_UP, GOAL_SPEED, HAND_HEIGHT, HAND_SPEED
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 
 from lfd.core.processes import ProcessMap, cores, in_order
 from lfd.core.protocols import Progress, silent
-from lfd.interaction.scenes import RobotOptions, scene_of
+from lfd.interaction.interactive_robot import KINDS, RobotOptions
+from lfd.interaction.scenes import scene_of
 from lfd.loops.interacting import InteractRecipe, Trial, label, run_trial
 
-KINDS = ("obstacle", "known", "passive", "active")
 GRADIENTS = {"implicit": 0.0, "differences": 1e-5}
 """How a plan is differentiated, and the step of central differences [m/s^2, rad or m/s]."""
 CONTROL_HZ = 5

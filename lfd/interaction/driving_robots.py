@@ -1,26 +1,18 @@
-"""Robots that drive among people: one planner, with what it takes people for as an option (chapter 10.6).
+"""Robots that drive among people (chapter 10.6); `lfd.interaction.interactive_robot` has the four kinds.
 
-    obstacle   they keep their speed, whatever the robot does, and so does who follows them
-    known      they have one theta, given: u_H* = argmax R_H(u_R, u_H, theta)
-    passive    theta is one of some types: argmax sum_theta b(theta) R_goal(u_R, u_H*(theta)), b updated by what is seen
-    active     the same, with information: argmax I(b, u_R) + lambda(t) sum_theta b(theta) R_goal
-
-The person of several types is one follower, whose controls are those of all types one after the other: their rewards
-add up, and the expectation over theta is the robot's reward of the whole. I is the sum of what is expected of the
-person's next choice at each step of the plan, at least the information of all of them together, since choices are
-independent given theta. lambda(t) = lambda_0 exp(t / tau): first ask, then go.
+An obstacle keeps its speed, and so does who follows it.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from lfd.core.errors import InputError, UnknownName
-from lfd.core.protocols import Decision, Observation
+from lfd.core.errors import UnknownName
+from lfd.core.protocols import Observation
 from lfd.interaction.driving_model import (
     GOALS,
     PERSON_HIGH,
@@ -37,123 +29,78 @@ from lfd.interaction.driving_model import (
     seen_from,
 )
 from lfd.interaction.driving_people import ACCELERATIONS, choice_rewards, choices_now
-from lfd.interaction.information import information_gain
-from lfd.interaction.intent import IntentBelief
-from lfd.interaction.receding_horizon import Limits, RecedingHorizon
+from lfd.interaction.interactive_robot import InteractiveRobot, RobotOptions, log_likelihood_of
+from lfd.interaction.receding_horizon import Limits
+from lfd.interaction.stackelberg import Plan
 from lfd.worlds.driving_world import ACTION_HIGH, ACTION_LOW, Car, DrivingScene, seen_cars, seen_second
 
-KINDS = ("obstacle", "known", "passive", "active")
 STILL = 1e-6
 """Differences of speed that count as none [m/s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriverOptions:
-    """What a robot at the wheel is like."""
+class DriverOptions(RobotOptions):
+    """What a robot at the wheel is like; steps of a plan are half a second each."""
 
-    kind: str
-    """obstacle, known, passive or active."""
+    types: ClassVar[Mapping[str, tuple[float, ...]]] = TYPES
+
     assumed: str = "aggressive"
-    """The type that a `known` person is taken for."""
-    horizon: int = 5
-    """Steps of the plan, of half a second each."""
-    gradients: int = 4
-    """Gradients for each plan."""
-    difference: float = 0.0
-    """Step of finite differences in the implicit gradient's place; 0 for the implicit one."""
-    rationality: float = 0.3
-    """Of the people, as the robot believes."""
-    goal_weight: float = 0.05
-    """lambda_0 of the active robot."""
-    patience_s: float = 2.0
-    """tau of the active robot [s]."""
     learned: tuple[tuple[str, tuple[float, ...]], ...] = ()
     """Types with the theta that was learned for them (`lfd.interaction.person_reward`), in place of the known one."""
 
     @property
-    def theta(self) -> dict[str, tuple[float, ...]]:
-        """Of each type, as the robot believes."""
-        return TYPES | dict(self.learned)
+    def theta(self) -> Mapping[str, tuple[float, ...]]:
+        return {**TYPES, **dict(self.learned)}
 
     def check(self) -> None:
-        """Raise `UnknownName` for another kind or type, `InputError` for numbers out of range."""
-        if self.kind not in KINDS:
-            raise UnknownName("robot kind", self.kind, KINDS)
-        for name in (self.assumed, *dict(self.learned)):
+        super().check()
+        for name in dict(self.learned):
             if name not in TYPES:
                 raise UnknownName("type of person", name, TYPES)
-        for name in ("horizon", "rationality", "goal_weight", "patience_s"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} = {getattr(self, name)}: give a number above 0")
 
 
-class InteractiveDriver:
-    """The robot; its decisions carry the belief as signals, where it has one."""
+class InteractiveDriver(InteractiveRobot[Situation]):
+    """The robot at the wheel."""
+
+    _controls = 2
 
     def __init__(self, scene: DrivingScene, control_hz: int, options: DriverOptions):
         options.check()
-        self.name, self._scene, self._dt, self._options = options.kind, scene, 1.0 / control_hz, options
-        names = [options.assumed] if options.kind in ("known", "obstacle") else sorted(TYPES)
-        self._names = tuple(names)
-        self._theta = torch.tensor([options.theta[name] for name in names], dtype=torch.float64)
-        bounds = (torch.tensor(np.tile(end, options.horizon)) for end in (ACTION_LOW, ACTION_HIGH))
-        low, high = bounds
-        self._low, self._high = low, high
-        self.planner = RecedingHorizon(
-            Limits(
-                robot=(low, high), person=(PERSON_LOW, PERSON_HIGH), gradients=options.gradients,
-                difference=options.difference,
-            )
+        self._scene, self._options = scene, options
+        self._low, self._high = (torch.tensor(np.tile(end, options.horizon)) for end in (ACTION_LOW, ACTION_HIGH))
+        limits = Limits(
+            robot=(self._low, self._high), person=(PERSON_LOW, PERSON_HIGH), gradients=options.gradients,
+            difference=options.difference,
         )  # fmt: skip
-
-    @property
-    def belief(self) -> Mapping[str, float]:
-        """Probability of each type."""
-        return MappingProxyType(dict(zip(self._names, self._belief.probabilities.tolist(), strict=True)))
+        names = [options.assumed] if options.kind in ("known", "obstacle") else sorted(TYPES)
+        super().__init__(control_hz, options, names, limits)
 
     def reset(self, rng: np.random.Generator) -> None:
-        """Begin an episode; nothing is drawn."""
-        del rng
-        self.planner.forget()
-        self._belief = IntentBelief(self._names, torch.ones(len(self._names)))
-        self._before: tuple[Situation, np.ndarray] | None = None
+        super().reset(rng)
         self._looked: tuple[Situation, Tensor, tuple[np.ndarray, np.ndarray]] | None = None
-        self._time = 0.0
 
-    def act(self, observation: Observation) -> Decision:
-        now = Situation(self._scene, *seen_cars(observation), seen_second(observation))
-        if self._before is not None and len(self._names) > 1:
-            self._belief = self._belief.updated(self._log_likelihood(now.person))
+    def _look(self, observation: Observation) -> Situation:
+        return Situation(self._scene, *seen_cars(observation), seen_second(observation))
+
+    def _plan(self, now: Situation) -> Plan:
         size = self._options.horizon * len(self._names)
-        plan = self.planner.plan(
+        return self.planner.plan(
             lambda u_robot, u_human: self._robot_reward(now, u_robot, u_human),
             lambda u_robot, u_human: self._person_reward(now, u_robot, u_human),
             self._starts(now.robot),
             torch.zeros(size, dtype=torch.float64),
             shift=self._dt / STEP_S,
-            controls=2,
+            controls=self._controls,
             followers=len(self._names),
             derivatives=lambda u_robot, u_human: self._person_derivatives(now, u_robot, u_human),
             person=(hardest_braking(now.person.speed, self._options.horizon).repeat(len(self._names)), PERSON_HIGH),
         )
-        action = plan.u_robot[:2].numpy().copy()
-        self._before, self._time = (now, action), self._time + self._dt
-        if len(self._names) == 1:
-            return Decision(action)
-        return Decision(
-            action,
-            signals={"belief": dict(self.belief), "belief_entropy": {"entropy": float(self._belief.entropy)}},
-        )
 
-    def _log_likelihood(self, person: Car) -> Tensor:
-        """log p of what the person has just done, for each type: their speed tells which accelerations it may be."""
-        assert self._before is not None
-        before, action = self._before
+    def _log_likelihood(self, before: Situation, action: np.ndarray, now: Situation) -> Tensor:
+        """The person's speed tells which accelerations it may have been."""
         logs = choices_now(before, self._theta, action, self._options.rationality)
         speeds = torch.clamp(before.person.speed + ACCELERATIONS * self._dt, min=0.0)
-        away = (speeds - person.speed).abs()
-        same = away <= away.min() + STILL
-        return torch.logsumexp(torch.where(same, logs, -torch.inf), dim=1)
+        return log_likelihood_of(logs, (speeds - now.person.speed).abs(), STILL)
 
     def _person_reward(self, now: Situation, u_robot: Tensor, u_human: Tensor) -> Tensor:
         """Sum over types of R_H; of an obstacle, what makes it keep its speed."""
@@ -202,11 +149,12 @@ class InteractiveDriver:
             cars.append(seen_from(now.second, path[0][..., None, :], path[1][..., None, :], way))
         b = self._belief.probabilities
         goal = goal_reward(GOALS[self._scene.name], self._scene.cruise, u_robot, path, cars) @ b
-        if self._options.kind != "active":
-            return goal
-        weight = self._options.goal_weight * np.exp(self._time / self._options.patience_s)
-        way, _ = now.person_path((b[:, None] * u_human.unflatten(-1, (len(b), -1))).sum(-2))
-        return self._information(now, u_robot, path, way, (b[:, None] * speed).sum(-2)) + weight * goal
+
+        def information() -> Tensor:
+            mean, _ = now.person_path((b[:, None] * u_human.unflatten(-1, (len(b), -1))).sum(-2))
+            return self._information(now, u_robot, path, mean, (b[:, None] * speed).sum(-2))
+
+        return self._wanted(goal, information)
 
     def _together(
         self, now: Situation, u_robot: Tensor, u_human: Tensor
@@ -229,8 +177,7 @@ class InteractiveDriver:
         acceleration, steering = (values.flatten() for values in u_robot.unflatten(-1, (-1, 2)).unbind(-1))
         person, first = (now.person, way.flatten(), speed.flatten()), (acceleration, steering)
         rewards = choice_rewards(self._scene, self._theta, (x, y, yaw, v), person, first)
-        likelihood = torch.softmax(self._options.rationality * rewards, dim=-1).transpose(0, 1)
-        return information_gain(self._belief.probabilities, likelihood).view(way.shape).sum(-1)
+        return self._gain(rewards, way.shape)
 
     def _starts(self, robot: Car) -> Tensor:
         """Plans to compare: onto the line at several accelerations, half-way to it, and braking beside it."""

@@ -6,51 +6,20 @@ A scene's rows are all that `lfd interact` and exact replay know of it.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from lfd.core.errors import UnknownName
-from lfd.core.protocols import Decision, Observation, World
+from lfd.core.protocols import Observation, World
 from lfd.interaction import driving_model, driving_people, table_model, table_people
 from lfd.interaction.driving_robots import DriverOptions, InteractiveDriver
-from lfd.interaction.receding_horizon import RecedingHorizon
+from lfd.interaction.interactive_robot import InteractiveRobot, RobotOptions
 from lfd.interaction.table_robots import InteractiveReacher, ReacherOptions
 from lfd.worlds import shared_table
 from lfd.worlds.driving_world import DrivingWorld, least_distance, load_scene, seen_cars
 from lfd.worlds.shared_table import SharedTableWorld
-
-
-@runtime_checkable
-class RobotOptions(Protocol):
-    """What a robot of some scene is like: a frozen dataclass."""
-
-    @property
-    def kind(self) -> str:
-        """obstacle, known, passive or active."""
-        ...
-
-    @property
-    def assumed(self) -> str:
-        """The type that a `known` person is taken for."""
-        ...
-
-    def check(self) -> None:
-        """Raise `InputError` for what is none."""
-        ...
-
-
-@runtime_checkable
-class Robot(Protocol):
-    """A policy that plans among people."""
-
-    name: str
-    planner: RecedingHorizon
-
-    def reset(self, rng: np.random.Generator) -> None: ...
-
-    def act(self, observation: Observation) -> Decision: ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +36,7 @@ class InteractionScene:
     """Makes a robot's options from `kind`, `assumed` and others by name."""
     world: Callable[[str, int, float], World]
     """From the people, the control rate [Hz] and their rationality; it may be the same one, to be reset."""
-    robot: Callable[..., Robot]
+    robot: Callable[..., InteractiveRobot[Any]]
     """From the control rate [Hz] and the options."""
     type_of: Callable[[Float[np.ndarray, "D"]], str]
     """The type that a person's theta is nearest to."""

@@ -1,29 +1,22 @@
-"""Robots that share a table: one planner, with what it takes people for as an option (chapter 10.6).
+"""Robots that share a table (chapter 10.6); `lfd.interaction.interactive_robot` has the four kinds.
 
-    obstacle   the hand keeps its velocity, whatever the robot does
-    known      the person has one theta, given: u_H* = argmax R_H(u_R, u_H, theta)
-    passive    theta is one of six: argmax sum_theta b(theta) R_goal(u_R, u_H*(theta), theta), b updated by what is seen
-    active     the same, with information: argmax I(b, u_R) + lambda(t) sum_theta b(theta) R_goal
-
-As on the road (`lfd.interaction.driving_robots`): people of several types are one follower with a block for each type,
-I is the sum of what is expected of the person's next choice at each step of the plan, and lambda(t) = lambda_0 exp(t /
-tau). The first velocity of the plan is the action; the world keeps it off the hand. An obstacle claims no cube.
+theta is one of six, and R_goal depends on it, too. An obstacle keeps its velocity, and claims no cube. The first
+velocity of the plan is the action; the world keeps it off the hand.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lfd.core.errors import InputError, UnknownName
-from lfd.core.protocols import Decision, Observation
-from lfd.interaction.information import information_gain
-from lfd.interaction.intent import IntentBelief
-from lfd.interaction.receding_horizon import Limits, RecedingHorizon
+from lfd.core.protocols import Observation
+from lfd.interaction.interactive_robot import InteractiveRobot, RobotOptions, log_likelihood_of
+from lfd.interaction.receding_horizon import Limits
+from lfd.interaction.stackelberg import Plan
 from lfd.interaction.table_model import (
     STEP_S,
     TYPES,
@@ -38,105 +31,58 @@ from lfd.interaction.table_people import VELOCITIES, choice_rewards, choices_now
 from lfd.worlds.shared_table import ABOVE_M, HAND_HIGH, HAND_LOW, REST_M, Table, seen_table
 from lfd.worlds.shared_table_guard import GOAL_SPEED, HAND_SPEED
 
-KINDS = ("obstacle", "known", "passive", "active")
 STILL_M = 1e-7
 """Differences of where the hand is that count as none [m]."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReacherOptions:
-    """What a robot at the table is like."""
+class ReacherOptions(RobotOptions):
+    """What a robot at the table is like; steps of a plan are 0.4 s each."""
 
-    kind: str
-    """obstacle, known, passive or active."""
+    types: ClassVar[Mapping[str, tuple[float, ...]]] = TYPES
+
     assumed: str = "middle-insists"
-    """The type that a `known` person is taken for."""
-    horizon: int = 5
-    """Steps of the plan, of 0.4 s each."""
     gradients: int = 3
-    """Gradients for each plan."""
-    difference: float = 0.0
-    """Step of finite differences in the implicit gradient's place; 0 for the implicit one."""
-    rationality: float = 0.3
-    """Of the people, as the robot believes."""
-    goal_weight: float = 0.05
-    """lambda_0 of the active robot."""
     patience_s: float = 1.0
-    """tau of the active robot [s]."""
-
-    def check(self) -> None:
-        """Raise `UnknownName` for another kind or type, `InputError` for numbers out of range."""
-        if self.kind not in KINDS:
-            raise UnknownName("robot kind", self.kind, KINDS)
-        if self.assumed not in TYPES:
-            raise UnknownName("type of person", self.assumed, TYPES)
-        for name in ("horizon", "rationality", "goal_weight", "patience_s"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"{name} = {getattr(self, name)}: give a number above 0")
 
 
-class InteractiveReacher:
-    """The robot; its decisions carry the belief as signals, where it has one."""
+class InteractiveReacher(InteractiveRobot[Table]):
+    """The robot at the table."""
+
+    _controls = 3
 
     def __init__(self, control_hz: int, options: ReacherOptions, goal: TableGoal | None = None):
         options.check()
-        self.name, self._dt, self._options = options.kind, 1.0 / control_hz, options
-        self._goal = goal or TableGoal()
-        only = {"known": options.assumed, "obstacle": "middle-yields"}  # the second claims nothing
-        self._names = (only[options.kind],) if options.kind in only else tuple(sorted(TYPES))
-        self._theta = torch.tensor([TYPES[name] for name in self._names], dtype=torch.float64)
-        self.planner = RecedingHorizon(
-            Limits(
-                robot=(-GOAL_SPEED, GOAL_SPEED), person=(-HAND_SPEED, HAND_SPEED), gradients=options.gradients,
-                difference=options.difference, ridge=1e-6,
-            )
+        self._options, self._goal = options, goal or TableGoal()
+        limits = Limits(
+            robot=(-GOAL_SPEED, GOAL_SPEED), person=(-HAND_SPEED, HAND_SPEED), gradients=options.gradients,
+            difference=options.difference, ridge=1e-6,
         )  # fmt: skip
+        only = {"known": options.assumed, "obstacle": "middle-yields"}  # the second claims nothing
+        names = (only[options.kind],) if options.kind in only else sorted(TYPES)
+        super().__init__(control_hz, options, names, limits)
 
-    @property
-    def belief(self) -> Mapping[str, float]:
-        """Probability of each type."""
-        return MappingProxyType(dict(zip(self._names, self._belief.probabilities.tolist(), strict=True)))
+    def _look(self, observation: Observation) -> Table:
+        return seen_table(observation)
 
-    def reset(self, rng: np.random.Generator) -> None:
-        """Begin an episode; nothing is drawn."""
-        del rng
-        self.planner.forget()
-        self._belief = IntentBelief(self._names, torch.ones(len(self._names)))
-        self._before: tuple[Table, np.ndarray] | None = None
-        self._time = 0.0
-
-    def act(self, observation: Observation) -> Decision:
-        table = seen_table(observation)
-        if self._before is not None and len(self._names) > 1:
-            self._belief = self._belief.updated(self._log_likelihood(table.hand))
-        now, keeps = reach_now(table), self._velocity(table)
-        plan = self.planner.plan(
-            lambda u_robot, u_human: self._robot_reward(now, u_robot, u_human),
-            lambda u_robot, u_human: self._person_reward(now, keeps, u_robot, u_human),
-            self._starts(now),
+    def _plan(self, now: Table) -> Plan:
+        reach, keeps = reach_now(now), self._velocity(now)
+        return self.planner.plan(
+            lambda u_robot, u_human: self._robot_reward(reach, u_robot, u_human),
+            lambda u_robot, u_human: self._person_reward(reach, keeps, u_robot, u_human),
+            self._starts(reach),
             keeps.repeat_interleave(self._options.horizon).repeat(len(self._names)),
             shift=self._dt / STEP_S,
-            controls=3,
+            controls=self._controls,
             followers=len(self._names),
-            derivatives=lambda u_robot, u_human: self._person_derivatives(now, keeps, u_robot, u_human),
-        )
-        action = plan.u_robot[:3].numpy().copy()
-        self._before, self._time = (table, action), self._time + self._dt
-        if len(self._names) == 1:
-            return Decision(action)
-        return Decision(
-            action,
-            signals={"belief": dict(self.belief), "belief_entropy": {"entropy": float(self._belief.entropy)}},
+            derivatives=lambda u_robot, u_human: self._person_derivatives(reach, keeps, u_robot, u_human),
         )
 
-    def _log_likelihood(self, hand: Float[np.ndarray, "2"]) -> Float[Tensor, "P"]:
-        """log p of what the person has just done, for each type: where the hand is tells which velocities it may be."""
-        assert self._before is not None
-        table, action = self._before
-        logs = choices_now(table, self._theta, action, self._options.rationality)
-        ends = np.clip(table.hand + self._dt * VELOCITIES.numpy(), HAND_LOW, HAND_HIGH)
-        away = torch.from_numpy(np.linalg.norm(ends - hand, axis=1))
-        return torch.logsumexp(torch.where(away <= away.min() + STILL_M, logs, -torch.inf), dim=1)
+    def _log_likelihood(self, before: Table, action: np.ndarray, now: Table) -> Float[Tensor, "P"]:
+        """Where the hand is tells which velocities it may have had."""
+        logs = choices_now(before, self._theta, action, self._options.rationality)
+        ends = np.clip(before.hand + self._dt * VELOCITIES.numpy(), HAND_LOW, HAND_HIGH)
+        return log_likelihood_of(logs, torch.from_numpy(np.linalg.norm(ends - now.hand, axis=1)), STILL_M)
 
     def _velocity(self, table: Table) -> Float[Tensor, "2"]:
         """Of the hand in the last step [m/s]."""
@@ -169,10 +115,7 @@ class InteractiveReacher:
         path, b = now.robot_path(u_robot), self._belief.probabilities
         hand = now.person_path(u_human.unflatten(-1, (len(self._names), 2, -1)))
         goal = goal_reward(self._goal, now, self._theta, u_robot, path, hand) @ b
-        if self._options.kind != "active":
-            return goal
-        weight = self._options.goal_weight * np.exp(self._time / self._options.patience_s)
-        return self._information(now, u_robot, path, (b[:, None, None] * hand).sum(-3)) + weight * goal
+        return self._wanted(goal, lambda: self._information(now, u_robot, path, (b[:, None, None] * hand).sum(-3)))
 
     def _information(self, now: Reach, u_robot: Tensor, path: Tensor, hand: Tensor) -> Tensor:
         """Sum over the plan's steps of I(b, u_R) [nats], with the person where they are expected."""
@@ -184,8 +127,7 @@ class InteractiveReacher:
         rewards = choice_rewards(
             now, self._theta, gripper.reshape(-1, 3), there.reshape(-1, 2), velocity.reshape(-1, 3)
         )
-        likelihood = torch.softmax(self._options.rationality * rewards, dim=-1).transpose(0, 1)
-        return information_gain(self._belief.probabilities, likelihood).view(path.shape[:-1]).sum(-1)
+        return self._gain(rewards, path.shape[:-1])
 
     def _starts(self, now: Reach) -> Float[Tensor, "S n"]:
         """Plans to compare: to each cube that is left, back, and nowhere."""

@@ -13,7 +13,8 @@ from scipy.stats import t as student
 from lfd.core.artifact import new_folder, write_json, write_manifest
 from lfd.core.errors import InputError, UnknownName
 from lfd.core.protocols import Observation, Observer, Progress, Transition, World, silent
-from lfd.interaction.scenes import InteractionScene, RobotOptions, scene_of
+from lfd.interaction.interactive_robot import RobotOptions
+from lfd.interaction.scenes import InteractionScene, scene_of
 from lfd.record.episode_file import McapRecorder, Origin
 from lfd.record.mcap_file import SUFFIX
 from lfd.run.wilson import wilson_interval
