@@ -1,18 +1,17 @@
 """Makes the pictures of the console in the documentation (`make pictures`): its real page, in Chromium."""
 
-import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
 
+from lfd.bench.browser import browser_page, put_notice_away
 from lfd.console.console import console
 from lfd.console.serving import free_port
 
 PICTURES = Path("docs/pictures")
-ARGUMENTS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WIDTH, HEIGHT = 1200, 750
 LONGEST_MS = 300_000
 
@@ -65,26 +64,19 @@ SHOWN: dict[str, Callable[[Page], None]] = {
 
 def main(names: list[str]) -> None:
     """Make the pictures of some names, or all."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        sys.exit("the pictures are taken in Chromium: make system")
     for name in names or SHOWN:
         with (
             TemporaryDirectory() as folder,
             console(Path(folder), port=free_port()) as running,
-            sync_playwright() as play,
+            browser_page(WIDTH, HEIGHT, LONGEST_MS) as page,
         ):
-            browser = play.chromium.launch(executable_path=chromium, args=ARGUMENTS)
-            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-            page.set_default_timeout(LONGEST_MS)
             page.goto(running.url)
             page.wait_for_function("document.documentElement.dataset.lfdDrives === 'true'")
             _wait(page, "choose what to do below")
-            page.get_by_text("Software WebGL rendering").locator("xpath=../../..//button").first.click()
+            put_notice_away(page)
             SHOWN[name](page)
             running.page.show_latency()
             page.screenshot(path=PICTURES / f"{name}.png")
-            browser.close()
 
 
 def _begin(page: Page, mode: str, told: str) -> None:

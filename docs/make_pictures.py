@@ -1,25 +1,24 @@
 """Makes the pictures of Rerun in the documentation (`make pictures`): real artifacts in Rerun's page, in Chromium.
 
 What is shown is made first, into outputs/pictures, unless it is there. It works without a screen and without a graphics
-card; Chromium is the one of the system (`apt install chromium`).
+card; Chromium is the one of the system (`make system`).
 """
 
 import io
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Page
 
+from lfd.bench.browser import browser_page
 from lfd.cli import main as lfd
 from lfd.loops.replaying import listing
 from lfd.replay.rerun_scene.outputs import Sheet, served
 
 MADE, PICTURES = Path("outputs/pictures"), Path("docs/pictures")
-ARGUMENTS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WIDTH, HEIGHT = 1200, 700
 STILL_MS, LONGEST_MS = 20_000, 600_000
 """The page is finished when nothing of it has changed for so long; it may take this long."""
@@ -42,21 +41,18 @@ SHOWN = {
 
 def main(names: list[str]) -> None:
     """Make the pictures of some names, or all."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        sys.exit("the pictures are taken in Chromium: apt install chromium")
     for name in names or SHOWN:
         source, numbers = SHOWN[name]
         if not (MADE / source).is_dir() and lfd([*COMMANDS[source], "--out", str(MADE / source)]) != 0:
             sys.exit(f"{source} cannot be made")
         clips = tuple(clip for entry in listing(MADE / source).chosen(numbers).values() for clip in entry.open())
-        with served([Sheet(name, clips, plays=False)]) as address, sync_playwright() as play:
-            browser = play.chromium.launch(executable_path=chromium, args=ARGUMENTS)
-            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        with (
+            served([Sheet(name, clips, plays=False)]) as address,
+            browser_page(WIDTH, HEIGHT, LONGEST_MS) as page,
+        ):
             page.goto(address)
             *_, last = _changes(page)
             Image.fromarray(last).save(PICTURES / f"{name}.png", optimize=True)
-            browser.close()
 
 
 def _changes(page: Page) -> Iterator[np.ndarray]:

@@ -2,48 +2,37 @@
 
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, BrowserType, Locator, Page, sync_playwright
+from playwright.sync_api import Locator, Page
 
+from lfd.bench import browser
+from lfd.bench.browser import chromium
 from lfd.console.console import Console, console
 from lfd.console.page import Page as ConsolePage
 from lfd.console.serving import free_port
 from lfd.core.rotations import matrix_from_wxyz
 
 ROOT = Path(__file__).parent.parent
-FLAGS = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE_MS = 90_000
 
 
-def chromium() -> str:
-    """The program; on a machine without it the test is skipped, but never in CI."""
-    found = shutil.which("chromium") or shutil.which("chromium-browser")
-    if found is None and not os.environ.get("CI"):
+def need_chromium() -> None:
+    """On a machine without it the test is skipped, but never in CI."""
+    if chromium() is None and not os.environ.get("CI"):
         pytest.skip("no Chromium here: `make system` installs it")
-    assert found is not None, "CI has no Chromium: .ci/run calls `make system`"
-    return found
-
-
-def launched(kind: BrowserType) -> Browser:
-    """A browser of its own: of two pages of one browser, one would be behind the other and not be drawn."""
-    return kind.launch(executable_path=chromium(), args=list(FLAGS))
 
 
 @contextmanager
 def browser_page(width: int = 960, height: int = 600) -> Iterator[Page]:
     """An empty page."""
-    with sync_playwright() as playwright:
-        browser = launched(playwright.chromium)
-        page = browser.new_page(viewport={"width": width, "height": height})
-        page.set_default_timeout(PATIENCE_MS)
+    need_chromium()
+    with browser.browser_page(width, height, PATIENCE_MS) as page:
         yield page
-        browser.close()
 
 
 @contextmanager
@@ -64,7 +53,7 @@ class Driver:
         """Open the page, and put away what hides the arm."""
         self.page.goto(url)
         self.page.wait_for_selector("[data-lfd-status]")
-        self.page.get_by_text("Software WebGL rendering").locator("xpath=../../..//button").first.click()
+        browser.put_notice_away(self.page)
 
     def told(self) -> str:
         """What the page says of what goes on."""

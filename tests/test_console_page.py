@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lfd.bench.browser import launched
 from lfd.core.artifact import read_manifest
 from lfd.record.episode_file import read_episode
 from lfd.rewards.reward_artifact import load_reward
-from tests.console_page import Driver, browser_page, launched, running_console
+from tests.console_page import Driver, browser_page, running_console
 
 pytestmark = pytest.mark.slow
 

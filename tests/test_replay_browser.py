@@ -1,7 +1,5 @@
 """Rerun's page as a person sees it, in a real headless Chromium, and the command that serves it."""
 
-import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -16,10 +14,9 @@ import pytest
 from lfd.record.png import decode_png
 from lfd.replay.clip import episode_clip
 from lfd.replay.rerun_scene.outputs import Sheet, served
+from tests.console_page import browser_page
 from tests.test_replay_live_view import ends
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-ARGUMENTS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 WIDTH, HEIGHT = 1000, 640
 LOADED_S = 420.0
 """How long the page may take until the robot is seen [s]: it draws without a graphics card."""
@@ -49,14 +46,8 @@ def shows_curves(picture: np.ndarray) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(
-    CHROMIUM is None and "CI" not in os.environ, reason="no Chromium; `apt install chromium` brings one"
-)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_the_page_shows_the_arm_and_its_curves_without_the_internet(recorded, tmp_path) -> None:
-    from playwright.sync_api import sync_playwright
-
-    assert CHROMIUM is not None, "this test needs Chromium in CI: apt install chromium"
     outside: list[str] = []  # refused
 
     def only_here(route, request) -> None:
@@ -68,10 +59,8 @@ def test_the_page_shows_the_arm_and_its_curves_without_the_internet(recorded, tm
 
     with (
         served([Sheet("recorded", (episode_clip(recorded, "recorded"),), plays=False)]) as address,
-        sync_playwright() as play,
+        browser_page(WIDTH, HEIGHT) as page,
     ):
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
         page.route("**/*", only_here)
         page.goto(address)
         deadline, png = time.monotonic() + LOADED_S, b""
@@ -81,7 +70,6 @@ def test_the_page_shows_the_arm_and_its_curves_without_the_internet(recorded, tm
             png = page.screenshot(timeout=180_000)
             picture = decode_png(png)
         Path(tmp_path / "page.png").write_bytes(png)
-        browser.close()
     assert shows_the_arm(picture), f"see {tmp_path}/page.png"
     assert shows_curves(picture), f"see {tmp_path}/page.png"
     blank = np.full_like(picture, BACKGROUND)

@@ -6,12 +6,9 @@ the middle of them with a key held down. Chromium draws without a GPU, which tak
 """
 
 import os
-import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lfd.bench.browser import MARK, browser_page
 from lfd.console.console import console
 from lfd.console.page import Page
 from lfd.console.serving import free_port
@@ -36,9 +34,6 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page as BrowserPage
 
 RECIPE = Path("datasets/lift_panda.toml")
-MARK = "--lfd-bench"
-"""By which the browser is found among the processes."""
-FLAGS = (MARK, "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE_MS = 120_000
 HELD = ("r", "f", "w", "s", "a", "d")
 HELD_S, EPISODE_S, AWAY_S = 0.3, 10.0, 1.0
@@ -76,7 +71,7 @@ def bench_console(*, minutes: float, reload_every_s: float, seed: int, progress:
     stood: list[float] = []
     with TemporaryDirectory() as name, console(Path(name), recipes=Path(), port=free_port()) as running:
         out, served = Path(name) / "recordings", running.page
-        with _browser_page() as page, progress("bench console", round(60 * minutes)) as bar:
+        with browser_page(960, 600, PATIENCE_MS) as page, progress("bench console", round(60 * minutes)) as bar:
             page.goto(running.url)
             page.wait_for_function(DRIVES)
             page.wait_for_function(SAYS, arg="choose what to do below")
@@ -176,24 +171,6 @@ def _group() -> int:
         except FileNotFoundError:  # it has just ended
             continue
     raise InputError("the browser has ended")
-
-
-@contextmanager
-def _browser_page() -> Iterator["BrowserPage"]:
-    """An empty page."""
-    program = shutil.which("chromium") or shutil.which("chromium-browser")
-    if program is None:
-        raise InputError("no Chromium here: make system installs it")
-    try:
-        from playwright.sync_api import sync_playwright
-    except ModuleNotFoundError as error:
-        raise InputError("no Playwright here, which drives the page: pip install 'lfd[dev]'") from error
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=list(FLAGS))
-        page = browser.new_page(viewport={"width": 960, "height": 600})
-        page.set_default_timeout(PATIENCE_MS)
-        yield page
-        browser.close()
 
 
 def _resident_mb() -> float:

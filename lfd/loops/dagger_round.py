@@ -16,10 +16,11 @@ import numpy as np
 
 from lfd.convert.to_lerobot import convert
 from lfd.core.artifact import heal, read_manifest, sha256, write_json
+from lfd.core.errors import InputError
 from lfd.core.protocols import BatchPolicy, Decision, Progress
 from lfd.experts.registry import make_expert
 from lfd.loops.dagger_control import learner_of, who_acts
-from lfd.loops.dagger_person import Person
+from lfd.loops.dagger_person import QUIT, Person
 from lfd.loops.dagger_recipe import LoopRecipes
 from lfd.record.demonstrations import EPISODE, begin_recordings, numbers_in, record, take_cameras
 from lfd.record.episode_file import McapRecorder, Origin, episode_of
@@ -147,13 +148,15 @@ class Round:
         there, learners, recipes = numbers_in(recordings, "$"), self._learners(), self.recipes
         wanted = recipes.dagger.episodes_per_round - len(there)
         if wanted > 0:
-            person.look_after(
+            done = person.look_after(
                 learners, self.worlds[0], self._generator,
                 lambda number: self._recorder(recordings, learners[0].name, number),
                 first=max(there, default=-1) + 1, wanted=wanted,
                 horizon=recipes.horizon, hold_steps=recipes.record.hold_steps,
                 rest_seconds=recipes.dagger.gate_rest_seconds, longer="--set dagger.rollout_seconds=60",
             )  # fmt: skip
+            if done.successes + done.failures < wanted:
+                raise InputError(QUIT)
 
     def _index(self, number: int) -> int:
         """(stage, seed, index) decide the rollout with a number."""

@@ -39,10 +39,9 @@ def trial_of(policy: Path, robot: str | None, *, longest_s: float) -> Trial:
 
 
 def watch(trial: Trial, out: Path, person: Person, *, rollouts: int, progress: Progress = silent) -> Session:
-    """Rollouts of a policy in a person's care, added to the recordings in `out`.
+    """Rollouts of a policy in a person's care, added to the recordings in `out`; fewer when the person quits.
 
-    Raises `InputError` when the person quits before `rollouts` are recorded (those that are there stay), `OutputError`
-    when `out` holds something else, and `PolicyError` for a policy that does not fit.
+    Raises `OutputError` when `out` holds something else, and `PolicyError` for a policy that does not fit.
     """
     about, recipe = trial.about, trial.recipe
     manifest = read_manifest(out) if out.is_dir() else None
