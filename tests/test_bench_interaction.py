@@ -18,7 +18,7 @@ def trial(index: int, seconds: float, certain: float | None, distance: float = 2
     return Trial(
         index=index, person="passive", success=True, seconds=seconds, collided=False, least_distance=distance,
         certain_s=certain, entropy=() if certain is None else (0.7,) * (index + 1) + (0.1,),
-        offsets=((5.0, -3.5), (15.0, 0.0)), plan_ms=10.0, solves=5.0,
+        offsets=((5.0, -3.5), (15.0, 0.0)), plan_ms=10.0, solves=5.0, per_gradient=1.0,
     )  # fmt: skip
 
 
@@ -38,12 +38,14 @@ def test_the_questions_are_answered_by_ratios() -> None:
 
 
 def test_a_page_and_a_picture_hold_every_scene(tmp_path) -> None:
-    cost = {"implicit": {"ms": 50.0, "solves": 8.0}, "differences": {"ms": 400.0, "solves": 88.0}}
+    cost = {"implicit": {"ms": 50.0, "solves": 8.0, "per_gradient": 1.0}}
+    cost["differences"] = {"ms": 400.0, "solves": 88.0, "per_gradient": 21.0}
     measured = InteractionBench(scenes={"merge": TRIALS, "crossing": TRIALS}, planning={"merge": cost})
     sections = sections_of(measured)
     assert list(sections)[:2] == ["Interaction: merge", "Interaction: crossing"]
     planning = sections["Interaction: a plan with implicit and with finite differences"]
-    assert "11.0x as many" in planning["merge: best responses of a plan, horizon 5"]
+    assert "11.0x as many" in planning["merge: best responses of a plan, all starts included"]
+    assert "21.0x as many" in planning["merge: best responses of a gradient"]
     plot(measured, tmp_path / "interaction.png")
     assert (tmp_path / "interaction.png").stat().st_size > 10_000
 
@@ -78,4 +80,6 @@ def test_the_benchmark_runs_all_robots_on_the_same_people() -> None:
     assert len({of[0].offsets[0] for of in robots.values()}) == 1
     planning = measured.planning["merge"]
     assert planning["differences"]["solves"] > 5 * planning["implicit"]["solves"]
+    assert planning["differences"]["per_gradient"] == 21.0  # one for each end of 10 controls, and one for J
+    assert planning["implicit"]["per_gradient"] == 1.0
     assert all(np.isfinite(of[0].seconds) for of in robots.values())

@@ -93,7 +93,9 @@ def farthest_of_gripper(world):
     model, data = world._arm._model, world._arm._data
     centre = world._arm.observe()[world._arm.layout["ee_pos"]] + np.array([0.0, 0.0, BALL_UP])
     farthest = 0.0
-    for geom in world._gripper:
+    for geom in world._solid:
+        if not model.body(model.geom_bodyid[geom]).name.startswith("gripper0"):
+            continue
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
             mesh = model.geom_dataid[geom]
             begin = model.mesh_vertadr[mesh]

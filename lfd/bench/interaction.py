@@ -25,7 +25,7 @@ class InteractionBench:
     scenes: dict[str, dict[str, list[Trial]]]
     """Scene to robot to its trials."""
     planning: dict[str, dict[str, dict[str, float]]]
-    """Scene to implicit and differences to processor time of a plan [ms] and best responses of a plan."""
+    """Scene to implicit and differences to processor time of a plan [ms], best responses of it and of a gradient."""
 
 
 def bench_interaction(
@@ -75,4 +75,4 @@ def planning_cost(recipe: InteractRecipe, difference: float, steps: int) -> dict
     robot = scene_of(recipe.scene).options(kind="passive", difference=difference)
     short = replace(recipe, max_seconds=steps / recipe.control_hz)
     trial = run_trial(short, robot, 0)
-    return {"ms": trial.plan_ms, "solves": trial.solves}
+    return {"ms": trial.plan_ms, "solves": trial.solves, "per_gradient": trial.per_gradient}

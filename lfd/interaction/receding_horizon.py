@@ -42,7 +42,11 @@ class Limits:
 
 
 class RecedingHorizon:
-    """A planner that remembers its last plan; `seconds` of the processor and `solves` say what each plan took."""
+    """A planner that remembers its last plan.
+
+    Of each plan, `seconds` are those of the processor, `solves` the best responses, those to the starts included, and
+    `per_gradient` those of one gradient.
+    """
 
     def __init__(self, within: Limits):
         within.check()
@@ -54,6 +58,7 @@ class RecedingHorizon:
         self._last: Plan | None = None
         self.seconds: list[float] = []
         self.solves: list[int] = []
+        self.per_gradient: list[float] = []
 
     def plan(
         self,
@@ -122,6 +127,7 @@ class RecedingHorizon:
         self._last = replace(plan, human_solves=plan.human_solves + count)
         self.seconds.append(time.process_time() - began)
         self.solves.append(self._last.human_solves)
+        self.per_gradient.append(plan.human_solves / plan.gradients)
         return self._last
 
 

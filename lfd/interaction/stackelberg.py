@@ -40,6 +40,8 @@ class Plan:
     """Whether the gradient vanishes, but for controls at their bounds."""
     human_solves: int
     """Best responses that were computed."""
+    gradients: int
+    """Gradients that were computed."""
     status: str
     """How the search ended, in the optimiser's words."""
     ridge: float = 0.0
@@ -178,6 +180,7 @@ def plan_stackelberg(
         value=value,
         converged=bool(np.abs(pushed).max(initial=0.0) <= max(tolerance, 1e-5 * (1.0 + abs(value)))),
         human_solves=solves,
+        gradients=int(found.nfev),
         status=str(found.message),
         ridge=added,
     )

@@ -89,6 +89,8 @@ class Trial:
     """Median processor time of a plan [ms]."""
     solves: float
     """Best responses of a plan, in the mean."""
+    per_gradient: float
+    """And of one gradient."""
 
 
 class _Watch:
@@ -157,6 +159,7 @@ def run_trial(recipe: InteractRecipe, robot: RobotOptions, index: int, observers
         offsets=tuple(watch.offsets),
         plan_ms=1e3 * float(np.median(policy.planner.seconds)),
         solves=float(np.mean(policy.planner.solves)),
+        per_gradient=float(np.mean(policy.planner.per_gradient)),
     )
 
 

@@ -223,11 +223,11 @@ class SharedTableWorld:
         self._begin = self._arm.get_state()
 
     def _bind(self) -> None:
-        """Find the hand's ball and the gripper's collision geoms in the present model."""
+        """Find the hand's ball and the collision geoms of gripper and links in the present model."""
         model = self._arm._model
         self._ball = model.geom(f"{HAND}_ball").id
-        bodies = {b for b in range(model.nbody) if model.body(b).name.startswith("gripper0")}
-        self._gripper = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies and model.geom_group[g] == 0]
+        bodies = {b for b in range(model.nbody) if model.body(b).name.startswith(("gripper0", "robot0"))}
+        self._solid = [g for g in range(model.ngeom) if model.geom_bodyid[g] in bodies and model.geom_group[g] == 0]
 
     def _tick(self, wanted: Float[np.ndarray, "3"], velocity: Float[np.ndarray, "2"]) -> str:
         """Arm and hand for `TICK_S`; why it cannot go on, if so."""
@@ -241,7 +241,7 @@ class SharedTableWorld:
         off = float(np.linalg.norm(self._arm.observe()[self._arm.layout["ee_pos"]] - self._goal))
         apart, now = self.distance(), f"after t = {self._arm._data.time:.2f} s"
         if apart < LEAST_DISTANCE:
-            return f"gripper and hand were {apart:.3f} m apart {now}, the limit is {LEAST_DISTANCE} m"
+            return f"arm and hand were {apart:.3f} m apart {now}, the limit is {LEAST_DISTANCE} m"
         if off > TRACKING:
             return f"the gripper was {off:.3f} m off its goal {now}; the limit is proven for {TRACKING:.3f} m"
         return ""
@@ -252,9 +252,9 @@ class SharedTableWorld:
         return self._arm.step(np.append(np.clip((goal - gripper) / DELTA_M, -1.0, 1.0), OPEN))
 
     def distance(self) -> float:
-        """Between the surfaces of the gripper's collision geoms and the hand's ball [m]."""
+        """Between the surfaces of the collision geoms of gripper and links and the hand's ball [m]."""
         model, data = self._arm._model, self._arm._data
-        return min(mujoco.mj_geomDistance(model, data, geom, self._ball, FAR_M, None) for geom in self._gripper)
+        return min(mujoco.mj_geomDistance(model, data, geom, self._ball, FAR_M, None) for geom in self._solid)
 
     def _move(self, hand: Float[np.ndarray, "2"], velocity: Float[np.ndarray, "2"]) -> None:
         """Put the hand and what it holds where they are after a tick; a cube that it has come to, it takes."""

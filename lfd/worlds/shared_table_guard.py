@@ -36,7 +36,7 @@ from jaxtyping import Bool, Float
 TICK_S = 0.05
 """dt, between goals of the controller [s]."""
 LEAST_DISTANCE = 0.05
-"""Between the surfaces of gripper and hand [m]."""
+"""Between the surfaces of arm and hand [m]."""
 GOAL_SPEED, HAND_SPEED = 0.2, 0.13
 """w_R and w_H [m/s]."""
 STIFFNESS = 150.0
