@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from lfd.core.artifact import read_manifest, sha256
 from lfd.core.episode import Episode
 from lfd.core.errors import OutputError, RecipeError, UnknownName
+from lfd.core.protocols import Observers
 from lfd.core.recipe import load_toml
 from lfd.data.frames import load_frames
 from lfd.experts.registry import make_expert
@@ -158,7 +159,14 @@ def test_what_the_loop_leaves(looped) -> None:
 
 def test_the_policy_does_not_depend_on_the_number_of_worlds(looped, tmp_path) -> None:
     out, report = looped
-    alone = dagger(recipes(), tmp_path / "alone", most_worlds=1)
+    seen: list[list[int]] = []
+
+    def watched() -> Observers:
+        seen.append([])
+        return lambda index: seen[-1].append(index) or ()
+
+    alone = dagger(recipes(), tmp_path / "alone", most_worlds=1, watched=watched)
+    assert [len(episodes) for episodes in seen] == [2, 2, 2, 2]  # demonstrations, rollouts, and an evaluation after each
     assert without_seconds(alone) == without_seconds(report)
     assert weights(tmp_path / "alone" / "policy") == weights(out / "policy")
 

@@ -67,8 +67,9 @@ def test_what_is_shown_is_the_world_and_the_world_does_not_notice(lift_world) ->
     run(lift_world, [alone])
     board, seen = Remembered(), States()
     live = LiveWorlds(board)
+    watching = live.begin()
     for index in range(3):
-        run(lift_world, [seen, *live.observers(index)])
+        run(lift_world, [seen, *watching(index)])
         np.testing.assert_array_equal(seen.rows, alone.rows)
     time.sleep(1.0)
     live.close()
@@ -90,13 +91,28 @@ def test_what_is_shown_is_the_world_and_the_world_does_not_notice(lift_world) ->
     )
 
 
+def test_each_run_is_counted_from_its_beginning(lift_world) -> None:
+    board = Remembered()
+    live = LiveWorlds(board)
+    for episodes in (3, 1):
+        watching = live.begin()
+        for index in range(episodes):
+            run(lift_world, list(watching(index)), steps=1)
+        time.sleep(0.5)
+    live.close()
+    assert [board.told[0], board.told[-1]] == [
+        dict(zip(("success", "interval_low", "interval_high"), (0.0, *wilson_interval(0, count)), strict=True))
+        for count in (3, 1)
+    ]
+
+
 def test_an_error_while_drawing_is_not_lost(lift_world) -> None:
     class Broken(Remembered):
         def scene(self, place: int) -> Seen:
             raise RuntimeError("no more paint")
 
     live = LiveWorlds(Broken())
-    run(lift_world, list(live.observers(0)))
+    run(lift_world, list(live.begin()(0)))
     deadline = time.monotonic() + 20
     while live._drawing.is_alive() and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -127,8 +143,9 @@ def test_worlds_and_curves_arrive_where_a_browser_looks(lift_world, tmp_path) ->
     told: list[str] = []
     with live_worlds("evaluation", 1, told.append) as live:
         reader = received(told[0], tmp_path / "worlds.rrd")
+        watching = live.begin()
         for index in range(4):
-            run(lift_world, list(live.observers(index)))
+            run(lift_world, list(watching(index)))
             time.sleep(1.0)
         ended(reader)
     held = columns(tmp_path / "worlds.rrd")
@@ -152,6 +169,7 @@ def test_worlds_and_curves_arrive_where_a_browser_looks(lift_world, tmp_path) ->
 
 def test_what_cannot_be_watched(lfd_fails, tmp_path) -> None:
     out = tmp_path / "out"
-    said = lfd_fails("record", LIFT, "--live", "--device", "keyboard", "--out", out)
-    assert "leave out --live" in said
+    for command in (("record", LIFT), ("dagger", "policies/dagger_lift.toml")):
+        said = lfd_fails(*command, "--live", "--device", "keyboard", "--out", out)
+        assert "leave out --live" in said
     assert "leave out one of them" in lfd_fails("record", LIFT, "--live", "--cluster", "--out", out)

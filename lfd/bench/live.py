@@ -57,15 +57,15 @@ def bench_live(
                 record_random(world, folder / "live.mcap", seed, observers(0), paced=paced)
             return _spent() - began, time.perf_counter() - wall
 
-        first, _ = recorded(board.observers, paced=False)  # loads the model and sends its shapes
+        first, _ = recorded(board.begin(), paced=False)  # loads the model and sends its shapes
         second, _ = recorded(unwatched, paced=False)
         of_a_core = []
         for _ in range(pairs):
-            (seen, wall), (alone, _) = (recorded(watching, paced=True) for watching in (board.observers, unwatched))
+            (seen, wall), (alone, _) = (recorded(watching, paced=True) for watching in (board.begin(), unwatched))
             of_a_core.append((seen - alone) / wall)
         found["share of a core for a world that is watched"] = round(float(np.median(of_a_core)), 4)
         found["processor time of recording at full speed, watched to not"] = _ratio(
-            lambda: recorded(board.observers, paced=False, times=5),
+            lambda: recorded(board.begin(), paced=False, times=5),
             lambda: recorded(unwatched, paced=False, times=5),
             pairs,
         )
@@ -77,7 +77,7 @@ def bench_live(
                 pass
 
         found["processor time of evaluation at full speed, watched to not"] = _ratio(
-            lambda: tried(board.observers), lambda: tried(unwatched), pairs
+            lambda: tried(board.begin()), lambda: tried(unwatched), pairs
         )
         board.close()
     with live_curves(lambda _address: None) as report:

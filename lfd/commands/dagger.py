@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lfd.commands.demonstrations import live_view
-from lfd.commands.options import ALL_WORLDS, Commands, Result, count, output, overrides, put
+from lfd.commands.options import ALL_WORLDS, Commands, Result, count, live, output, overrides, put, watching
 from lfd.core.errors import InputError
 from lfd.experts.keys import HELP
 
@@ -44,6 +44,7 @@ def add(commands: Commands) -> None:
         "--worlds", type=count, default=ALL_WORLDS, metavar="N",
         help="worlds to run in parallel at the most; the result is the same (default: one a core)",
     )  # fmt: skip
+    live(made, "the worlds in motion, and the success of each round's rollouts and evaluation so far")
     output(made, "the dataset, the rounds and the policy")
     overrides(made)
 
@@ -61,13 +62,16 @@ def run_dagger(given: Namespace) -> Result:
     put(learn, "dagger", rounds=given.rounds, seed=given.seed, gate=None if given.device is None else "human")
     if given.no_view and given.device is None:
         raise InputError("--no-view is for people: choose their device with --device keyboard, spacemouse or gamepad")
+    if given.live and given.device is not None:
+        raise InputError(f"with --device {given.device} you see the robot already: leave out --live")
     recipes = LoopRecipes.of(learn, data, f"{given.recipe} and {given.dataset_recipe}:")
-    with _person(given) as person:
+    with _person(given) as person, watching(given, "DAgger") as begin:
         report = dagger(
             recipes,
             given.out,
             most_worlds=given.worlds,
             person=person,
+            watched=begin,
             resume=given.resume,
             overwrite=given.overwrite,
             progress=progress_bar,

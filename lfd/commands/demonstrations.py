@@ -83,14 +83,14 @@ def run_record(given: Namespace) -> Result:
         return _record_person(given, recipe, tables)
     if given.no_view:
         raise InputError("--no-view is for people: choose their device with --device keyboard, spacemouse or gamepad")
-    with watching(given, "recording") as observers, machines(given.cluster) as cluster:
+    with watching(given, "recording") as begin, machines(given.cluster) as cluster:
         done = record(
             recipe,
             given.out,
             tables=tables,
             most_worlds=given.worlds,
             cluster=cluster,
-            observers=observers,
+            observers=begin(),
             resume=given.resume,
             overwrite=given.overwrite,
             progress=progress_bar,

@@ -119,7 +119,7 @@ def run_evaluate(given: Namespace) -> Result:
     tables = about_policy(given.policy, given.dataset)["recipe"]
     put(tables, "eval", episodes=given.episodes, seed=given.seed)
     recipe = build(EvalRecipe, tables["eval"], f"{given.policy} [eval]")
-    with watching(given, "evaluation") as observers, machines(given.cluster) as cluster:
+    with watching(given, "evaluation") as begin, machines(given.cluster) as cluster:
         done = evaluate(
             given.policy,
             recipe,
@@ -129,7 +129,7 @@ def run_evaluate(given: Namespace) -> Result:
             dataset=given.dataset,
             most_worlds=given.worlds,
             cluster=cluster,
-            observers=observers,
+            observers=begin(),
             overwrite=given.overwrite,
             progress=progress_bar,
         )

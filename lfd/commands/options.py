@@ -88,18 +88,18 @@ def live(made: Any, what: str) -> None:
 
 @contextmanager
 def watching(given: argparse.Namespace, title: str) -> Iterator[Any]:
-    """What watches the episodes of a run, if that was asked for."""
+    """A function that gives what watches the episodes of a run that begins, if that was asked for."""
     from lfd.core.protocols import unwatched
 
     if not given.live:
-        yield unwatched
+        yield lambda: unwatched
         return
-    if given.cluster is not None:
+    if getattr(given, "cluster", None) is not None:
         raise InputError("--live shows worlds of this machine, --cluster runs them elsewhere: leave out one of them")
     from lfd.replay.live_worlds import live_worlds
 
     with live_worlds(title, min(given.worlds, os.cpu_count() or 1), tell_live) as shown:
-        yield shown.observers
+        yield shown.begin
 
 
 @contextmanager

@@ -15,13 +15,13 @@ of the demonstrations.
 """
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from lfd.core.artifact import check_output, new_folder, read_manifest, sha256, write_json, write_manifest
 from lfd.core.errors import InputError, OutputError
-from lfd.core.protocols import Progress, silent
+from lfd.core.protocols import Observers, Progress, silent, unwatched
 from lfd.experts.registry import check_expert
 from lfd.loops.dagger_person import Person
 from lfd.loops.dagger_recipe import HUMAN, LoopRecipes
@@ -39,6 +39,7 @@ def dagger(
     *,
     most_worlds: int = EVERY_CORE,
     person: Person | None = None,
+    watched: Callable[[], Observers] = lambda: unwatched,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -49,6 +50,8 @@ def dagger(
     round's, or where rounds are judged the best (the latest of equal ones). Worlds run in parallel, `most_worlds` at
     the most; the result does not depend on how many. With `resume` a loop goes on wherever it was interrupted, and ends
     with the same policy, bit for bit (on a CPU); it may then also run for more rounds.
+
+    `watched` gives what else watches the episodes of rollouts and of an evaluation that begin.
 
     With gate = "human" a `person` is the expert. Raises `OutputError` when `out` exists, or was made by another recipe,
     `InputError` when the person quits or is missing, and what the stages raise.
@@ -74,11 +77,12 @@ def dagger(
             worlds=worlds,
             labels_before=labels,
             person=person,
+            watched=watched,
             progress=progress,
         )
         rows.append(one.run())
     best = max(rows, key=lambda row: (row.get("judged", 0.0), row["round"]))
-    report = _summed(rows, best) | _final(out, recipes, best, worlds, progress)
+    report = _summed(rows, best) | _final(out, recipes, best, worlds, watched, progress)
     _hand_over(out, best, overwrite=resume or overwrite)
     plot(rows, out / CURVE)
     write_json(out / REPORT, report)
@@ -113,11 +117,16 @@ def _check_same(out: Path, recipes: LoopRecipes) -> None:
 
 
 def _final(
-    out: Path, recipes: LoopRecipes, best: Row, worlds: Sequence[RobosuiteWorld], progress: Progress
+    out: Path,
+    recipes: LoopRecipes,
+    best: Row,
+    worlds: Sequence[RobosuiteWorld],
+    watched: Callable[[], Observers],
+    progress: Progress,
 ) -> dict[str, Any]:
     """The evaluation of the policy that is handed over."""
     if "success_rate" not in best:
-        return evaluated(round_folder(out, best["round"]) / "policy", recipes.tried, worlds, progress)
+        return evaluated(round_folder(out, best["round"]) / "policy", recipes.tried, worlds, progress, watched())
     return {key: best[key] for key in ("success_rate", "interval", "successes")}
 
 

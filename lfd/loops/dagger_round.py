@@ -6,7 +6,7 @@ comes last. A round that was killed therefore goes on where it was, and ends as 
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ import numpy as np
 from lfd.convert.to_lerobot import convert
 from lfd.core.artifact import heal, read_manifest, sha256, write_json
 from lfd.core.errors import InputError
-from lfd.core.protocols import BatchPolicy, Decision, Progress
+from lfd.core.protocols import BatchPolicy, Decision, Observers, Progress, unwatched
 from lfd.experts.registry import make_expert
 from lfd.loops.dagger_control import learner_of, who_acts
 from lfd.loops.dagger_person import QUIT, Person
@@ -56,6 +56,8 @@ class Round:
     labels_before: int
     person: Person | None
     """The expert, where it is a person."""
+    watched: Callable[[], Observers]
+    """What else watches the episodes of rollouts and of an evaluation that begin."""
     progress: Progress
 
     @property
@@ -85,9 +87,10 @@ class Round:
         with self._lap("eval"):
             if dagger.judge_episodes:
                 judged = replace(self.recipes.tried, episodes=dagger.judge_episodes)
-                row["judged"] = successes(policy, judged, self.worlds, JUDGE, self.progress) / dagger.judge_episodes
+                row["judged"] = successes(policy, judged, self.worlds, JUDGE, self.progress, self.watched())
+                row["judged"] /= dagger.judge_episodes
             if dagger.evaluate == "every":
-                row |= evaluated(policy, self.recipes.tried, self.worlds, self.progress)
+                row |= evaluated(policy, self.recipes.tried, self.worlds, self.progress, self.watched())
         row["seconds"] = _seconds(self.folder)
         write_json(self.folder / REPORT, row)
         return row
@@ -103,7 +106,7 @@ class Round:
             return
         record(
             recipe, recordings, tables=self.recipes.tables, most_worlds=len(self.worlds), resume=begun,
-            overwrite=not begun, progress=self.progress,
+            overwrite=not begun, progress=self.progress, observers=self.watched(),
         )  # fmt: skip
 
     def _roll_out(self, recordings: Path) -> None:
@@ -114,21 +117,24 @@ class Round:
         if self.person is not None:
             self._look_after(self.person, recordings)
             return
-        control, following, left = self._control(), 0, self._budget()
+        control, watching, following, left = self._control(), self.watched(), 0, self._budget()
         with self.progress(f"round {self.number}", dagger.episodes_per_round) as bar:
             while following < dagger.episodes_per_round and (left is None or left > 0):
                 count, horizon = wave(dagger.episodes_per_round - following, left, recipes.horizon)
                 numbers = range(following, following + count)
                 there = set(numbers_in(recordings, "$"))
                 bar.advance(len(there.intersection(numbers)))
-                for solved in self._episodes(control, recordings, [n for n in numbers if n not in there], horizon):
+                wanted = [number for number in numbers if number not in there]
+                for solved in self._episodes(control, recordings, wanted, horizon, watching):
                     bar.advance(note=f"beta {self.beta:.2g}, {'solved' if solved else 'failed'}")
                 if left is not None:
                     files = [path for n in numbers if (path := _file(recordings, n)).is_file()]
                     left -= sum(counts_of(file).labels for file in files)
                 following += count
 
-    def _episodes(self, control: BatchPolicy, out: Path, numbers: Sequence[int], horizon: int) -> Iterator[bool]:
+    def _episodes(
+        self, control: BatchPolicy, out: Path, numbers: Sequence[int], horizon: int, watching: Observers
+    ) -> Iterator[bool]:
         """Run and record the episodes of some numbers; whether each was solved."""
         waiting = iter(numbers)
 
@@ -136,8 +142,8 @@ class Round:
             number = next(waiting, None)
             if number is None:
                 return None
-            recorder = self._recorder(out, control.name, number)
-            return Start(index=self._index(number), rng=self._generator(number), observers=[recorder])
+            seen_by = [self._recorder(out, control.name, number), *watching(number)]
+            return Start(index=self._index(number), rng=self._generator(number), observers=seen_by)
 
         hold_steps = self.recipes.record.hold_steps
         for _, outcome in rollouts(self.worlds, control, next_start, horizon=horizon, hold_steps=hold_steps):
@@ -280,20 +286,31 @@ def counts_of(file: Path, *, expert_acts: bool = False) -> Counts:
 
 
 def successes(
-    policy: Path, recipe: EvalRecipe, worlds: Sequence[RobosuiteWorld], stage: str, progress: Progress
+    policy: Path,
+    recipe: EvalRecipe,
+    worlds: Sequence[RobosuiteWorld],
+    stage: str,
+    progress: Progress,
+    observers: Observers = unwatched,
 ) -> int:
     """How many of the episodes of an evaluation a policy solves, from the start states of a stage."""
     solved = 0
     with progress(stage, recipe.episodes) as bar:
-        for _, outcome in Trial.of(policy, recipe).run(worlds, stage, range(recipe.episodes)):
+        for _, outcome in Trial.of(policy, recipe).run(worlds, stage, range(recipe.episodes), observers):
             solved += outcome.success
             bar.advance(note=f"{solved} solved")
     return solved
 
 
-def evaluated(policy: Path, recipe: EvalRecipe, worlds: Sequence[RobosuiteWorld], progress: Progress) -> Row:
+def evaluated(
+    policy: Path,
+    recipe: EvalRecipe,
+    worlds: Sequence[RobosuiteWorld],
+    progress: Progress,
+    observers: Observers = unwatched,
+) -> Row:
     """An evaluation as rows of a report: what `lfd eval` measures, without its recordings."""
-    solved = successes(policy, recipe, worlds, "eval", progress)
+    solved = successes(policy, recipe, worlds, "eval", progress, observers)
     interval = wilson_interval(solved, recipe.episodes)
     return {"success_rate": solved / recipe.episodes, "interval": list(interval), "successes": solved}
 

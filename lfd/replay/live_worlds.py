@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 import mujoco
 import numpy as np
 
-from lfd.core.protocols import Observation, Observer, Transition, World
+from lfd.core.protocols import Observation, Observer, Observers, Transition, World
 from lfd.replay.clip import kept_model
 from lfd.replay.live_view import INTEGRATION, Scene
 from lfd.run.wilson import wilson_interval
@@ -61,7 +61,7 @@ class _Reel:
 
 
 class LiveWorlds:
-    """Shows worlds on a board; `observers` are what the episodes of a run need for it.
+    """Shows worlds on a board; `begin` gives what the episodes of a run need for it.
 
     The shapes are those of the first episode: where a size is drawn for each one, such as that of Lift's cube, it is
     shown as it was then.
@@ -72,14 +72,20 @@ class LiveWorlds:
         self._reels: dict[int, _Reel | None] = {}
         """Place to what it shows."""
         self._place_of: dict[int, int] = {}
-        """A world's id to its place."""
+        """The id of a world of the run to its place."""
         self._ended: list[bool] = []
+        """Successes of the run."""
         self._over = threading.Event()
         self._drawing = threading.Thread(target=self._draw_all, name="live view", daemon=True)
         self._error: BaseException | None = None
         self._drawing.start()
 
-    def observers(self, index: int) -> Sequence[Observer]:
+    def begin(self) -> Observers:
+        """What watches the episodes of a run that begins: its worlds take the places, its success is counted."""
+        self._ended, self._place_of = [], {}
+        return self._watching
+
+    def _watching(self, index: int) -> Sequence[Observer]:
         """What watches the episode with a number."""
         del index
         return [_Watcher(self)]
@@ -109,7 +115,7 @@ class LiveWorlds:
     def _draw_all(self) -> None:
         try:
             stage = _Stage(self._board)
-            told = 0
+            told = self._ended, 0
             while not self._over.wait(1.0 / DRAWN_HZ):
                 now = time.monotonic()
                 with self._lock:
@@ -122,13 +128,13 @@ class LiveWorlds:
         except BaseException as error:  # it would be lost with the thread; the run itself goes on
             self._error = error
 
-    def _tell(self, told: int) -> int:
-        """Let the curves go on if an episode has ended since `told` of them; how many have."""
-        ended = len(self._ended)
-        if ended > told:
-            won = sum(self._ended[:ended])
+    def _tell(self, told: tuple[list[bool], int]) -> tuple[list[bool], int]:
+        """Let the curves go on if an episode has ended since `told`, the run's and how many; those of now."""
+        of, ended = self._ended, len(self._ended)
+        if ended > (told[1] if of is told[0] else 0):
+            won = sum(of[:ended])
             self._board.tell(dict(zip(RATE, (won / ended, *wilson_interval(won, ended)), strict=True)))
-        return ended
+        return of, ended
 
 
 class _Stage:
