@@ -1,5 +1,5 @@
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -7,12 +7,13 @@ import torch
 
 from lfd.cli import main
 from lfd.core.errors import InputError
-from lfd.interaction.driving_irl import FEATURES, choices_of, learn_theta, log_likelihood, together
+from lfd.interaction.choices_irl import Choices, learn_theta, of_people
+from lfd.interaction.driving_irl import FEATURES, WIDE, choices_of
 from lfd.interaction.driving_model import TYPES
 from lfd.interaction.driving_people import BoltzmannDriver, choices_now
 from lfd.interaction.driving_robots import DriverOptions, InteractiveDriver
 from lfd.interaction.person_reward import FILE, PersonReward, load_person_reward, save_person_reward, theta_of
-from lfd.loops.learning_people import predicted
+from lfd.loops.learning_people import choices_in, predicted
 from lfd.record.episode_file import McapRecorder, Origin, read_episode
 from lfd.worlds.driving_world import ACTION_HIGH, ACTION_LOW, DrivingWorld, load_scene, seen_cars
 from lfd.worlds.rollout import episode_rng, rollout
@@ -59,7 +60,7 @@ def recorded(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def parts(recorded):
+def people(recorded):
     return [choices_of(MERGE, read_episode(path)) for path in sorted(recorded.iterdir())]
 
 
@@ -70,7 +71,7 @@ def reward_of(found):
     )  # fmt: skip
 
 
-def test_recorded_choices_are_those_that_people_made_by_their_likelihoods(recorded, parts) -> None:
+def test_recorded_choices_are_those_that_people_made_by_their_likelihoods(recorded, people) -> None:
     """Against `choices_now`, step by step, with other weights than any."""
     from lfd.interaction.driving_model import Situation
 
@@ -81,26 +82,25 @@ def test_recorded_choices_are_those_that_people_made_by_their_likelihoods(record
         logs = choices_now(now, torch.from_numpy(theta)[None], action, 0.3)[0].numpy()
         a = (then.person.speed - now.person.speed) * 5
         value += logs[np.abs(np.linspace(-4.0, 2.5, 14) - a).argmin()]
-    assert log_likelihood(theta, parts[0], 0.3)[0] == pytest.approx(value, abs=1e-8)
+    assert of_people(theta, people[:1], 0.3)[0] == pytest.approx(value, abs=1e-8)
 
 
-def test_slope_and_curvature_are_those_of_finite_differences(parts) -> None:
-    choices, theta, units = together(parts[:3]), np.array([0.1, 0.4, 20.0, 10.0]), np.array([0.01, 0.01, 1.0, 1.0])
-    _, slope, information = log_likelihood(theta, choices, 0.3)
+def test_slope_and_curvature_are_those_of_finite_differences(people) -> None:
+    few, theta, units = people[:3], np.array([0.1, 0.4, 20.0, 10.0]), np.array([0.01, 0.01, 1.0, 1.0])
+    _, slope, information = of_people(theta, few, 0.3)
     for k, step in enumerate(1e-4 * units):
-        ends = [log_likelihood(theta + sign * step * np.eye(4)[k], choices, 0.3) for sign in (1.0, -1.0)]
+        ends = [of_people(theta + sign * step * np.eye(4)[k], few, 0.3) for sign in (1.0, -1.0)]
         assert slope[k] == pytest.approx((ends[0][0] - ends[1][0]) / (2.0 * step), rel=1e-5, abs=1e-6)
         np.testing.assert_allclose(information[k], -(ends[0][1] - ends[1][1]) / (2.0 * step), rtol=1e-4, atol=1e-6)
 
 
-def test_learned_weights_predict_held_out_people_better_than_the_default(parts) -> None:
-    seen, held_out = parts[:10], parts[10:]
-    found = learn_theta(together(seen), rationality=0.3)
+def test_learned_weights_predict_held_out_people_better_than_the_default(people) -> None:
+    seen, held_out = people[:10], people[10:]
+    found = learn_theta(seen, wide=np.array(WIDE), rationality=0.3)
     assert found.converged
     reward = reward_of(found)
     judged = predicted(held_out, reward)
-    truth = together(held_out)
-    best = log_likelihood(HASTY, truth, 0.3)[0] / len(truth.chosen)
+    best = of_people(HASTY, held_out, 0.3)[0] / choices_in(held_out)
     assert judged["learned"] > judged["default"] + 0.05
     assert judged["learned"] > judged["chance"] + 0.05
     assert judged["learned"] > best - 0.03
@@ -115,9 +115,7 @@ def test_choices_of_many_people_with_one_theta_give_it_back() -> None:
     logits = 0.3 * (known - features @ truth)
     p = np.exp(logits - logits.max(axis=1, keepdims=True))
     chosen = (rng.random(4000)[:, None] > (p / p.sum(axis=1, keepdims=True)).cumsum(axis=1)).sum(axis=1)
-    from lfd.interaction.driving_irl import Choices
-
-    found = learn_theta(Choices(known, features, chosen), rationality=0.3)
+    found = learn_theta([(Choices(known, features, chosen),)], wide=np.array(WIDE), rationality=0.3)
     assert (np.abs(found.theta - truth) < 4.0 * np.sqrt(np.diag(found.covariance))).all()
     assert (np.sqrt(np.diag(found.covariance)) < [0.05, 0.1, 5.0, 5.0]).all()
 
@@ -141,8 +139,8 @@ def test_a_robot_takes_people_for_what_was_learned(tmp_path, recorded, capfd) ->
 
 
 @pytest.mark.slow
-def test_interact_takes_a_learned_reward_and_says_where_it_is_from(tmp_path, parts) -> None:
-    found, out = learn_theta(together(parts), rationality=0.3), tmp_path / "hasty"
+def test_interact_takes_a_learned_reward_and_says_where_it_is_from(tmp_path, people) -> None:
+    found, out = learn_theta(people, wide=np.array(WIDE), rationality=0.3), tmp_path / "hasty"
     reward = reward_of(found)
     save_person_reward(reward, out, recipe={}, parents={}, overwrite=False)
     met = tmp_path / "met"
@@ -154,7 +152,7 @@ def test_interact_takes_a_learned_reward_and_says_where_it_is_from(tmp_path, par
 
 
 def saved(folder, reward):
-    save_person_reward(reward, folder / "saved", recipe={}, parents={}, overwrite=False)
+    save_person_reward(reward, folder / "saved", recipe={}, parents={}, overwrite=True)
     return folder / "saved"
 
 
@@ -175,7 +173,7 @@ def test_rewards_that_are_none_are_refused(tmp_path, recorded, lfd_fails) -> Non
     with pytest.raises(InputError, match="holds no person.json; `lfd irl people"):
         load_person_reward(tmp_path)
     with pytest.raises(InputError, match="no episode to learn from"):
-        together([])
+        learn_theta([], wide=np.array(WIDE), rationality=0.3)
     with pytest.raises(InputError, match="unknown type of person 'rude'"):
         DriverOptions(kind="known", learned=(("rude", (0.0,) * 4),)).check()
     out = tmp_path / "x"
@@ -185,5 +183,7 @@ def test_rewards_that_are_none_are_refused(tmp_path, recorded, lfd_fails) -> Non
     assert "leave none" in lfd_fails(*command, "passive", "--holdout", "14")
     given = ["--person-reward", tmp_path / "r", "--out", out]
     assert "--rationality 0.3" in lfd_fails("interact", "merge", *given[:1], saved(tmp_path, reward), *given[2:])
-    assert "is for the road" in lfd_fails("interact", "shared_table", *given)
+    given[1] = saved(tmp_path, replace(reward, rationality=0.3))
+    assert "unknown type of person 'passive'" in lfd_fails("interact", "shared_table", *given)
+    assert "where nobody is yields: give recordings of `lfd interact` in shared_table" in lfd_fails(*command, "yields")
     assert "above 0" in lfd_fails(*command, "passive", "--rationality", "0")

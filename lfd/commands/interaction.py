@@ -7,7 +7,6 @@ from argparse import Namespace
 from pathlib import Path
 
 from lfd.commands.options import Commands, Result, count, output
-from lfd.core.errors import InputError
 
 SCENES = ("merge", "crossing", "shared_table")
 KINDS = ("obstacle", "known", "passive", "active")
@@ -45,7 +44,7 @@ def add(commands: Commands) -> None:
     )  # fmt: skip
     made.add_argument(
         "--person-reward", nargs="+", type=Path, default=[], metavar="REWARD",
-        help="on the road: what robots take people of a type to be after, as `lfd irl people` learned it, one for a "
+        help="what robots take people of a type to be after, as `lfd irl people` learned it, one for a "
         "type (default: weights that lfd comes with)",
     )  # fmt: skip
     made.add_argument("--episodes", type=count, default=10, metavar="N", help="episodes of each robot (default: 10)")
@@ -56,7 +55,6 @@ def add(commands: Commands) -> None:
 def run_interact(given: Namespace) -> Result:
     """Robots among people."""
     from lfd.core.artifact import sha256
-    from lfd.interaction.driving_robots import DriverOptions
     from lfd.interaction.person_reward import load_person_reward, theta_of
     from lfd.interaction.scenes import scene_of
     from lfd.loops.interacting import InteractRecipe, interact, told
@@ -64,10 +62,8 @@ def run_interact(given: Namespace) -> Result:
 
     scene, learned = scene_of(given.scene), {}
     if given.person_reward:
-        if scene.options is not DriverOptions:
-            raise InputError(f"--person-reward is for the road, not for {given.scene}; leave it out")
         rewards = [load_person_reward(folder) for folder in given.person_reward]
-        learned["learned"] = theta_of(rewards, DriverOptions.rationality)
+        learned["learned"] = theta_of(rewards, scene.options.rationality)
     robots = scene.robots(given.robot_kind, given.assumed, **learned)
     recipe = InteractRecipe(
         scene=given.scene, robots=robots, person=given.person, episodes=given.episodes, seed=given.seed

@@ -169,7 +169,7 @@ def _irl(commands: Commands) -> None:
     made.add_argument(
         "method", choices=(*METHODS, PEOPLE),
         help="apprenticeship (Abbeel and Ng), margin (maximum margin planning), maxent (maximum entropy), people "
-        "(maximum entropy over what the people of `lfd interact merge` or `crossing` chose)",
+        "(maximum entropy over what the people of `lfd interact` chose)",
     )  # fmt: skip
     made.add_argument(
         "--dataset", type=Path, required=True, metavar="RECORDINGS|DATASET",
@@ -183,7 +183,11 @@ def _irl(commands: Commands) -> None:
         "weights are known, they judge the learned reward's plans there",
     )  # fmt: skip
     made.add_argument("--seed", type=int, default=0, metavar="S", help="seed of the candidates (default: 0)")
-    made.add_argument("--type", metavar="TYPE", help="people: whose weights they are, passive or aggressive")
+    made.add_argument(
+        "--type",
+        metavar="TYPE",
+        help="people: whose weights they are, passive or aggressive, at the table yields or insists",
+    )
     made.add_argument(
         "--rationality", type=float, default=0.3, metavar="R",
         help="people: how strictly they choose what is best; it sets the scale of the weights (default: 0.3)",

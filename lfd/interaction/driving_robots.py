@@ -3,7 +3,7 @@
 An obstacle keeps its speed, and so does who follows it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lfd.core.errors import UnknownName
 from lfd.core.protocols import Observation
 from lfd.interaction.driving_model import (
     GOALS,
@@ -43,20 +42,13 @@ class DriverOptions(RobotOptions):
     """What a robot at the wheel is like; steps of a plan are half a second each."""
 
     types: ClassVar[Mapping[str, tuple[float, ...]]] = TYPES
+    learnable: ClassVar[Collection[str]] = TYPES
 
     assumed: str = "aggressive"
-    learned: tuple[tuple[str, tuple[float, ...]], ...] = ()
-    """Types with the theta that was learned for them (`lfd.interaction.person_reward`), in place of the known one."""
 
     @property
     def theta(self) -> Mapping[str, tuple[float, ...]]:
         return {**TYPES, **dict(self.learned)}
-
-    def check(self) -> None:
-        super().check()
-        for name in dict(self.learned):
-            if name not in TYPES:
-                raise UnknownName("type of person", name, TYPES)
 
 
 class InteractiveDriver(InteractiveRobot[Situation]):

@@ -12,7 +12,7 @@ independent given theta. lambda(t) = lambda_0 exp(t / tau): first ask, then go.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
@@ -32,11 +32,13 @@ KINDS = ("obstacle", "known", "passive", "active")
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotOptions:
+class RobotOptions(ABC):
     """What a robot of some scene is like."""
 
     types: ClassVar[Mapping[str, tuple[float, ...]]]
     """Theta of each type of the scene's people."""
+    learnable: ClassVar[Collection[str]]
+    """Types whose weights may be learned."""
 
     kind: str
     """obstacle, known, passive or active."""
@@ -54,11 +56,13 @@ class RobotOptions:
     """lambda_0 of the active robot."""
     patience_s: float = 2.0
     """tau of the active robot [s]."""
+    learned: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    """Types with the weights that were learned for them (`lfd.interaction.person_reward`), in place of known ones."""
 
     @property
+    @abstractmethod
     def theta(self) -> Mapping[str, tuple[float, ...]]:
         """Of each type, as the robot believes."""
-        return self.types
 
     def check(self) -> None:
         """Raise `UnknownName` for another kind or type, `InputError` for numbers out of range."""
@@ -66,6 +70,9 @@ class RobotOptions:
             raise UnknownName("robot kind", self.kind, KINDS)
         if self.assumed not in self.types:
             raise UnknownName("type of person", self.assumed, self.types)
+        for name in dict(self.learned):
+            if name not in self.learnable:
+                raise UnknownName("type of person", name, self.learnable)
         for name in ("horizon", "rationality", "goal_weight", "patience_s"):
             if not getattr(self, name) > 0:
                 raise InputError(f"{name} = {getattr(self, name)}: give a number above 0")

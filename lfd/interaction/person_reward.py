@@ -10,11 +10,32 @@ import numpy as np
 
 from lfd.core.artifact import new_folder, write_json, write_manifest
 from lfd.core.errors import InputError, UnknownName
-from lfd.interaction.driving_irl import FEATURES
-from lfd.interaction.driving_model import TYPES
+from lfd.interaction import driving_irl, driving_model, table_irl, table_model
 
 KIND, FILE = "person_reward", "person.json"
 LEARN = "`lfd irl people --dataset RECORDINGS --type TYPE --out REWARD` learns one"
+
+
+@dataclass(frozen=True)
+class Learnable:
+    """A type of people whose weights can be learned."""
+
+    default: tuple[float, ...]
+    """What robots take them for otherwise."""
+    features: tuple[str, ...]
+    """What the weights are of."""
+    wide: tuple[float, ...]
+    """Standard deviations of their prior."""
+
+
+LEARNABLE = {
+    **{name: Learnable(theta, driving_irl.FEATURES, driving_irl.WIDE) for name, theta in driving_model.TYPES.items()},
+    **{
+        manner: Learnable((weight,), table_irl.FEATURES, table_irl.WIDE)
+        for manner, weight in table_model.MANNERS.items()
+    },
+}
+"""By name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,10 +43,10 @@ class PersonReward:
     """What one type of people is after."""
 
     type: str
-    """passive or aggressive: whose weights these are."""
+    """Whose weights these are: passive or aggressive, yields or insists."""
     features: tuple[str, ...]
     weights: tuple[float, ...]
-    """theta."""
+    """theta, or of people at the table its yielding."""
     spread: tuple[float, ...]
     """Standard deviation of each weight, by Laplace's approximation."""
     rationality: float
@@ -36,13 +57,14 @@ class PersonReward:
     """Mean of a choice that was learned from [nat]."""
 
     def __post_init__(self) -> None:
-        if self.type not in TYPES:
-            raise UnknownName("type of person", self.type, TYPES)
-        if self.features != FEATURES:
-            raise InputError(f"features are {', '.join(self.features)}, expected {', '.join(FEATURES)}; learn it again")
+        if self.type not in LEARNABLE:
+            raise UnknownName("type of person", self.type, LEARNABLE)
+        expected = LEARNABLE[self.type].features
+        if self.features != expected:
+            raise InputError(f"features are {', '.join(self.features)}, expected {', '.join(expected)}; learn it again")
         numbers = np.array([*self.weights, *self.spread, self.rationality])
-        if len(self.weights) != len(FEATURES) or not np.isfinite(numbers).all() or min(self.weights) < 0.0:
-            raise InputError(f"weights are {self.weights}: expected {len(FEATURES)} numbers from 0 on; learn it again")
+        if len(self.weights) != len(expected) or not np.isfinite(numbers).all() or min(self.weights) < 0.0:
+            raise InputError(f"weights are {self.weights}: expected {len(expected)} numbers from 0 on; learn it again")
 
 
 def save_person_reward(

@@ -5,15 +5,17 @@ A scene's rows are all that `lfd interact` and exact replay know of it.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from lfd.core.episode import Episode
 from lfd.core.errors import UnknownName
 from lfd.core.protocols import Observation, World
-from lfd.interaction import driving_model, driving_people, table_model, table_people
+from lfd.interaction import driving_irl, driving_model, driving_people, table_irl, table_model, table_people
+from lfd.interaction.choices_irl import Person
 from lfd.interaction.driving_robots import DriverOptions, InteractiveDriver
 from lfd.interaction.interactive_robot import InteractiveRobot, RobotOptions
 from lfd.interaction.table_robots import InteractiveReacher, ReacherOptions
@@ -32,12 +34,16 @@ class InteractionScene:
     """Who may be met: one type, a kind of them, or any."""
     assumed: str
     """Type that `known` takes people for where nothing else is said."""
-    options: Callable[..., RobotOptions]
+    options: type[RobotOptions]
     """Makes a robot's options from `kind`, `assumed` and others by name."""
     world: Callable[[str, int, float], World]
     """From the people, the control rate [Hz] and their rationality; it may be the same one, to be reset."""
     robot: Callable[..., InteractiveRobot[Any]]
     """From the control rate [Hz] and the options."""
+    learnable: tuple[str, ...]
+    """Types of people whose weights `lfd irl people` learns."""
+    choices: Callable[[Episode], Person]
+    """What the person of a recording chose from, for learning."""
     type_of: Callable[[Float[np.ndarray, "D"]], str]
     """The type that a person's theta is nearest to."""
     offset: Callable[[Observation], tuple[float, float]]
@@ -72,6 +78,8 @@ def _driving(name: str) -> InteractionScene:
         options=DriverOptions,
         world=world,
         robot=lambda control_hz, options: InteractiveDriver(scene, control_hz, options),
+        learnable=tuple(driving_model.TYPES),
+        choices=partial(driving_irl.choices_of, scene),
         type_of=driving_people.type_of,
         offset=offset,
         distance=least_distance,
@@ -99,6 +107,8 @@ SCENES: Mapping[str, InteractionScene] = {
         options=ReacherOptions,
         world=_table_world,
         robot=InteractiveReacher,
+        learnable=tuple(table_model.MANNERS),
+        choices=table_irl.choices_of,
         type_of=table_people.type_of,
         offset=_table_offset,
         distance=lambda observation: float(observation["hand_distance"][0]),

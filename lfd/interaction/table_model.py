@@ -173,7 +173,7 @@ def goal_reward(
     far = size(path[..., None, :] - torch.cat([now.cubes, heights], dim=-1))  # (*s, N, cubes)
     taken = torch.zeros(len(theta), len(numbers), dtype=torch.float64)
     if now.taken is None:
-        insists = theta[:, 1] == MANNERS["insists"]
+        insists = theta[:, 1] < 0.5 * YIELDING
         taken = CLAIMED * (insists[:, None] & (numbers == theta[:, 0, None])).double()
     else:
         taken[:, now.taken] = torch.inf

@@ -4,7 +4,7 @@ theta is one of six, and R_goal depends on it, too. An obstacle keeps its veloci
 velocity of the plan is the action; the world keeps it off the hand.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -18,6 +18,7 @@ from lfd.interaction.interactive_robot import InteractiveRobot, RobotOptions, lo
 from lfd.interaction.receding_horizon import Limits
 from lfd.interaction.stackelberg import Plan
 from lfd.interaction.table_model import (
+    MANNERS,
     STEP_S,
     TYPES,
     Reach,
@@ -40,10 +41,16 @@ class ReacherOptions(RobotOptions):
     """What a robot at the table is like; steps of a plan are 0.4 s each."""
 
     types: ClassVar[Mapping[str, tuple[float, ...]]] = TYPES
+    learnable: ClassVar[Collection[str]] = MANNERS
 
     assumed: str = "middle-insists"
     gradients: int = 3
     patience_s: float = 1.0
+
+    @property
+    def theta(self) -> Mapping[str, tuple[float, ...]]:
+        yielding = {name: (weight,) for name, weight in MANNERS.items()} | dict(self.learned)
+        return {name: (cube, *yielding[name.partition("-")[2]]) for name, (cube, _) in TYPES.items()}
 
 
 class InteractiveReacher(InteractiveRobot[Table]):

@@ -1,4 +1,4 @@
-"""What people at the wheel are after, from recordings of `lfd interact`: maximum entropy over their choices."""
+"""What people are after, from recordings of `lfd interact`: maximum entropy over their choices."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,11 +9,10 @@ import numpy as np
 from lfd.core.artifact import check_output, sha256
 from lfd.core.errors import InputError, UnknownName
 from lfd.core.protocols import Progress, silent
-from lfd.interaction.driving_irl import FEATURES, Choices, choices_of, learn_theta, log_likelihood, together
-from lfd.interaction.driving_model import TYPES
-from lfd.interaction.person_reward import PersonReward, save_person_reward
+from lfd.interaction.choices_irl import Person, learn_theta, of_people
+from lfd.interaction.person_reward import LEARNABLE, PersonReward, save_person_reward
+from lfd.interaction.scenes import SCENES
 from lfd.record.episode_file import read_episode, recordings_in
-from lfd.worlds.driving_world import SCENES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,33 +39,34 @@ def learn_people(
 
     Raises `UnknownName` for another type, `InputError` for recordings of other scenes or too few of them.
     """
-    if kind not in TYPES:
-        raise UnknownName("type of person", kind, TYPES)
+    if kind not in LEARNABLE:
+        raise UnknownName("type of person", kind, LEARNABLE)
     check_output(out, overwrite=overwrite)
     paths = recordings_in([source])
     if not 0 <= holdout < len(paths):
         raise InputError(f"{source} has {len(paths)} recordings, of which --holdout {holdout} leave none: give more")
-    parts: list[Choices] = []
+    people: list[Person] = []
     with progress("recordings", len(paths)) as bar:
         for path in paths:
             episode = read_episode(path)
-            if episode.metadata.task not in SCENES:
+            places = [name for name, scene in SCENES.items() if kind in scene.learnable]
+            if episode.metadata.task not in places:
                 raise InputError(
-                    f"{path} is of {episode.metadata.task}; people's rewards are learned on the road: give recordings "
-                    f"of `lfd interact` in {' or '.join(sorted(SCENES))}"
+                    f"{path} is of {episode.metadata.task}, where nobody is {kind}: give recordings of `lfd interact` "
+                    f"in {' or '.join(places)}"
                 )
-            parts.append(choices_of(SCENES[episode.metadata.task], episode))
+            people.append(SCENES[episode.metadata.task].choices(episode))
             bar.advance()
-    seen, rest = together(parts[: len(parts) - holdout]), parts[len(parts) - holdout :]
-    found = learn_theta(seen, rationality=rationality)
+    seen, rest = people[: len(people) - holdout], people[len(people) - holdout :]
+    found, count = learn_theta(seen, wide=np.array(LEARNABLE[kind].wide), rationality=rationality), choices_in(seen)
     reward = PersonReward(
         type=kind,
-        features=FEATURES,
+        features=LEARNABLE[kind].features,
         weights=tuple(found.theta.tolist()),
         spread=tuple(np.sqrt(np.diag(found.covariance)).tolist()),
         rationality=rationality,
-        choices=len(seen.chosen),
-        log_likelihood=log_likelihood(found.theta, seen, rationality)[0] / len(seen.chosen),
+        choices=count,
+        log_likelihood=of_people(found.theta, seen, rationality)[0] / count,
     )
     recipe = {"method": "people", "type": kind, "holdout": holdout, "rationality": rationality}
     save_person_reward(reward, out, recipe=recipe, parents={str(source): sha256(source)}, overwrite=overwrite)
@@ -74,12 +74,13 @@ def learn_people(
     return PeopleReport(reward=reward, converged=found.converged, held_out=judged)
 
 
-def predicted(parts: Sequence[Choices], reward: PersonReward) -> dict[str, float]:
+def predicted(people: Sequence[Person], reward: PersonReward) -> dict[str, float]:
     """Mean log-likelihood of a choice by what was learned, by the default weights of the type, and by chance [nat]."""
-    choices = together(parts)
-    count = len(choices.chosen)
-    weights = {"learned": reward.weights, "default": TYPES[reward.type]}
-    found = {
-        name: log_likelihood(np.array(theta), choices, reward.rationality)[0] / count for name, theta in weights.items()
-    }
-    return found | {"chance": -float(np.log(choices.known.shape[1]))}
+    count, weights = choices_in(people), {"learned": reward.weights, "default": LEARNABLE[reward.type].default}
+    found = {name: of_people(np.array(theta), people, reward.rationality)[0] / count for name, theta in weights.items()}
+    return found | {"chance": -float(np.log(people[0][0].known.shape[1]))}
+
+
+def choices_in(people: Sequence[Person]) -> int:
+    """How many choices were made."""
+    return sum(len(person[0].chosen) for person in people)
