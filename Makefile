@@ -30,7 +30,10 @@ results: $(READY)
 	$(BIN)/lfd bench train --results docs/results.md
 	$(BIN)/lfd bench compounding --results docs/results.md
 	$(BIN)/lfd bench dagger --results docs/results.md
+	$(BIN)/lfd bench comparisons --results docs/results.md
 	$(BIN)/lfd bench irl --results docs/results.md
+	$(BIN)/lfd bench corrections --results docs/results.md
+	$(BIN)/lfd bench interaction --results docs/results.md
 	$(BIN)/lfd bench replay --results docs/results.md
 	$(BIN)/lfd bench console --results docs/results.md
 	$(BIN)/lfd experts --episodes 50 --results docs/results.md

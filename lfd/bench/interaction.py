@@ -72,7 +72,7 @@ def recipe_of(scene: str, episodes: int, seed: int) -> InteractRecipe:
 
 def planning_cost(recipe: InteractRecipe, difference: float, steps: int) -> dict[str, float]:
     """Medians over the first steps of an episode of the robot that infers."""
-    robot = scene_of(recipe.scene).options(kind="passive", difference=difference)
+    (robot,) = scene_of(recipe.scene).robots(("passive",), difference=difference)
     short = replace(recipe, max_seconds=steps / recipe.control_hz)
     trial = run_trial(short, robot, 0)
     return {"ms": trial.plan_ms, "solves": trial.solves, "per_gradient": trial.per_gradient}
