@@ -40,6 +40,27 @@ def compare(page: Page) -> None:
     page.wait_for_timeout(6000)
 
 
+def supervise(page: Page) -> None:
+    """A learner is taken over in the last of three rounds."""
+    page.get_by_role("tab", name="Supervise").click()
+    for label, value in SMALL.items():
+        rows = page.locator(f"xpath=//label[text()='{label}']/ancestor::div[.//input][1]")
+        field = rows.locator("input").locator("visible=true").first
+        field.fill(str(value))
+        field.press("Tab")
+        page.wait_for_timeout(200)  # the page sends one value in 50 ms
+    _begin(page, "Supervise", "episode 0: waiting")
+    for last in (False, True):
+        _wait(page, "episode 0: waiting")
+        page.keyboard.press("Enter")
+        _wait(page, "episode 0: moving")
+        page.keyboard.down("f")
+        page.wait_for_timeout(1500)
+        if not last:
+            page.keyboard.up("f")
+            page.keyboard.press("n")
+
+
 def browse(page: Page) -> None:
     """Where a demonstration comes from."""
     demonstrate(page)
@@ -54,10 +75,20 @@ def browse(page: Page) -> None:
     page.locator("[data-lfd-card]").wait_for()
 
 
+SMALL = {
+    "rounds": 3,
+    "rollouts a round": 1,
+    "longest [s]": 60,
+    "demonstrations at first": 5,
+    "trials a round": 5,
+    "gradient steps": 500,
+}
+"""What is filled in before Supervise begins."""
 SHOWN: dict[str, Callable[[Page], None]] = {
     "console_demonstrate": demonstrate,
     "console_correct": correct,
     "console_compare": compare,
+    "console_supervise": supervise,
     "console_browse": browse,
 }
 

@@ -26,6 +26,7 @@ COMMANDS = {
     "recordings": ("record", "datasets/lift_panda.toml", "--episodes", "6", "--seed", "3"),
     "corrected": ("correct", "laptop", "--runs", "1"),
     "merge": ("interact", "merge", "--robot-kind", "obstacle", "active", "--episodes", "2"),
+    "table": ("interact", "shared_table", "--robot-kind", "active", "--person", "middle-insists", "--episodes", "1"),
     "preferred": ("compare", "datasets/cup_panda.toml", "--person", "simulated", "--questions", "3", "--plans", "12"),
 }
 """What is shown, and how it is made."""
@@ -34,6 +35,7 @@ SHOWN = {
     "replay_beside": ("recordings", (0, 2, 3)),
     "replay_correction": ("corrected", (0,)),
     "replay_interaction": ("merge", (0, 2)),
+    "replay_table": ("table", (0,)),
     "replay_comparison": ("preferred", (1,)),
 }
 """Picture to what is seen on it: of which artifact, and the numbers of its episodes side by side."""

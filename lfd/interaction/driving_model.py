@@ -9,14 +9,15 @@ person, the robot is d ahead along their path and e beside it.
                            + near(e) (giving way exp(-(d/10)^2) + standing sigmoid(d/6)) ]
     R_goal     = - sum_k [ lane (y/3.5)^2 + speed (v_R - cruise)^2 + speeding max(v_R - cruise, 0)^2 + effort a^2
                            + steering steering^2 + yaw yaw^2 + sum_cars danger exp(-(d/l_d)^2 - (e/l_e)^2) ]
-                 - blocked exp(-(outside/10)^2),      outside = max(d_last, 0) + max(-d'_last, 0)
+                 - blocked [ exp(-(max(o, 0)/10)^2) + max(-o, 0)/10 ],      o = max(d_last, -d'_last)
 
 theta = (speed, effort, giving way, standing): who gives way keeps off what is in front of them, whoever stands their
 ground minds that the robot is ahead; nobody wants to crash. near(e) = exp(-(e/w)^2) says how much of the robot is on
 their path, w is the scene's `in_the_way`: next to nothing of a car in the next lane. The last term tells a horizon that
-is too short for a whole change of lanes that the lane is blocked as long as the robot is alongside: not yet ahead of
-the first car or behind the last one, whose d is d'. A second car follows the person by its law, which is linear; that
-it would brake for the robot as well is not counted on.
+is too short for a whole change of lanes that the lane is blocked as long as the robot is alongside, and where it ends
+soonest: o is how far the robot is ahead of the first car or behind the last one, whose d is d', and negative between
+them. A second car follows the person by its law, which is linear; that it would brake for the robot as well is not
+counted on.
 """
 
 from collections.abc import Callable, Sequence
@@ -240,6 +241,6 @@ def goal_reward(
     for d, e in cars:
         danger = torch.exp(-((d / goal.along_m) ** 2) - (e / goal.beside_m) ** 2).sum(-1)
         found = found - goal.danger * danger
-    first, last = cars[0][0][..., -1], cars[-1][0][..., -1]
-    outside = torch.relu(first) + torch.relu(-last)
-    return found - goal.blocked * torch.exp(-((outside / goal.gap_m) ** 2))
+    outside = torch.maximum(cars[0][0][..., -1], -cars[-1][0][..., -1])
+    beyond, inside = torch.relu(outside), torch.relu(-outside)
+    return found - goal.blocked * (torch.exp(-((beyond / goal.gap_m) ** 2)) + inside / goal.gap_m)

@@ -28,6 +28,7 @@ from lfd.interaction.driving_model import (
     seen_from,
 )
 from lfd.interaction.driving_people import ACCELERATIONS, choice_rewards, choices_now
+from lfd.interaction.driving_way_out import steering_to, with_a_way_out
 from lfd.interaction.interactive_robot import InteractiveRobot, RobotOptions, log_likelihood_of
 from lfd.interaction.receding_horizon import Limits
 from lfd.interaction.stackelberg import Plan
@@ -87,6 +88,10 @@ class InteractiveDriver(InteractiveRobot[Situation]):
             derivatives=lambda u_robot, u_human: self._person_derivatives(now, u_robot, u_human),
             person=(hardest_braking(now.person.speed, self._options.horizon).repeat(len(self._names)), PERSON_HIGH),
         )
+
+    def _kept_safe(self, now: Situation, action: np.ndarray) -> np.ndarray:
+        others = [now.person] if now.second is None else [now.person, now.second]
+        return with_a_way_out(action, now.robot, others, self._scene.robot_y, self._dt)
 
     def _log_likelihood(self, before: Situation, action: np.ndarray, now: Situation) -> Tensor:
         """The person's speed tells which accelerations it may have been."""
@@ -181,9 +186,7 @@ class InteractiveDriver(InteractiveRobot[Situation]):
         controls = []
         for _ in range(self._options.horizon):
             held = max(acceleration, -robot.speed / STEP_S)
-            yaw = np.clip((y - robot.y) / (1.5 * robot.speed + 1.0), -0.2, 0.2)  # reached in about 1.5 s
-            turn = (yaw - robot.yaw) * 2.7 / (STEP_S * max(robot.speed, 1.0))
-            steering = float(np.clip(np.arctan(turn), ACTION_LOW[1], ACTION_HIGH[1]))
+            steering = float(steering_to(y, robot.y, robot.yaw, robot.speed, STEP_S))
             controls += [held, steering]
             robot = robot.moved(held, steering, STEP_S)
         return torch.clamp(torch.tensor(controls, dtype=torch.float64), self._low, self._high)

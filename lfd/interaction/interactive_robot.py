@@ -106,7 +106,7 @@ class InteractiveRobot[Seen](ABC):
         if self._before is not None and len(self._names) > 1:
             before, action = self._before
             self._belief = self._belief.updated(self._log_likelihood(before, action, now))
-        action = self._plan(now).u_robot[: self._controls].numpy().copy()
+        action = self._kept_safe(now, self._plan(now).u_robot[: self._controls].numpy().copy())
         self._before, self._time = (now, action), self._time + self._dt
         if len(self._names) == 1:
             return Decision(action)
@@ -128,6 +128,11 @@ class InteractiveRobot[Seen](ABC):
 
     @abstractmethod
     def _plan(self, now: Seen) -> Plan: ...
+
+    def _kept_safe(self, now: Seen, action: np.ndarray) -> np.ndarray:
+        """What is done in an action's place where it might leave no way out; where the world sees to it, nothing."""
+        del now
+        return action
 
     def _wanted(self, goal: Tensor, information: Callable[[], Tensor]) -> Tensor:
         """R_goal, its expectation taken; of the active robot I + lambda(t) R_goal."""
