@@ -41,7 +41,8 @@ def compare(page: Page) -> None:
 
 
 def supervise(page: Page) -> None:
-    """A learner is taken over in the last of three rounds."""
+    """A learner is taken over in the last of three rounds; the page is long enough for the plot."""
+    page.set_viewport_size({"width": WIDTH, "height": 1020})
     page.get_by_role("tab", name="Supervise").click()
     for label, value in SMALL.items():
         rows = page.locator(f"xpath=//label[text()='{label}']/ancestor::div[.//input][1]")
@@ -50,15 +51,13 @@ def supervise(page: Page) -> None:
         field.press("Tab")
         page.wait_for_timeout(200)  # the page sends one value in 50 ms
     _begin(page, "Supervise", "episode 0: waiting")
-    for last in (False, True):
-        _wait(page, "episode 0: waiting")
-        page.keyboard.press("Enter")
-        _wait(page, "episode 0: moving")
-        page.keyboard.down("f")
-        page.wait_for_timeout(1500)
-        if not last:
-            page.keyboard.up("f")
-            page.keyboard.press("n")
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => !document.querySelector('[data-lfd-status]').innerText.includes('episode')")
+    _wait(page, "episode 0: waiting")
+    page.keyboard.press("Enter")
+    page.keyboard.down("f")
+    _wait(page, "episode 0: moving")
+    page.wait_for_timeout(1500)
 
 
 def browse(page: Page) -> None:

@@ -25,7 +25,7 @@ STILL_MS, LONGEST_MS = 20_000, 600_000
 COMMANDS = {
     "recordings": ("record", "datasets/lift_panda.toml", "--episodes", "6", "--seed", "3"),
     "corrected": ("correct", "laptop", "--runs", "1"),
-    "merge": ("interact", "merge", "--robot-kind", "obstacle", "active", "--episodes", "2"),
+    "merge": ("interact", "merge", "--robot-kind", "obstacle", "active", "--person", "passive", "--episodes", "1"),
     "table": ("interact", "shared_table", "--robot-kind", "active", "--person", "middle-insists", "--episodes", "1"),
     "preferred": ("compare", "datasets/cup_panda.toml", "--person", "simulated", "--questions", "3", "--plans", "12"),
 }
@@ -34,7 +34,7 @@ SHOWN = {
     "replay": ("recordings", (0,)),
     "replay_beside": ("recordings", (0, 2, 3)),
     "replay_correction": ("corrected", (0,)),
-    "replay_interaction": ("merge", (0, 2)),
+    "replay_interaction": ("merge", (0, 1)),
     "replay_table": ("table", (0,)),
     "replay_comparison": ("preferred", (1,)),
 }

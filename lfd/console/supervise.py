@@ -1,9 +1,6 @@
 """Supervise: look after a learner, take over and hand back, retrain. Behind it is `lfd dagger --device` (HG-DAgger)."""
 
-import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import viser.uplot
@@ -13,13 +10,12 @@ from lfd.console.folder import recipes
 from lfd.console.html import hint
 from lfd.console.page import Page
 from lfd.core.errors import InputError
-from lfd.core.protocols import Bar
 from lfd.core.recipe import load_toml
 from lfd.experts.keys import Word
 from lfd.loops.dagger import dagger
 from lfd.loops.dagger_person import Person
 from lfd.loops.dagger_recipe import DATA_TABLES, HUMAN, LEARN_TABLES, LoopRecipes
-from lfd.loops.dagger_round import REPORT
+from lfd.loops.dagger_round import Row
 from lfd.loops.watching import trial_of, watch
 from lfd.worlds.robots import load_teleop
 
@@ -66,18 +62,17 @@ def add_supervise(page: Page) -> None:
         tables = load_toml(data_in / f"{source.value}.toml", DATA_TABLES)
         used = LoopRecipes.of(learn, tables, f"{recipe.value} and {source.value}:")
 
-        @contextmanager
-        def progress(label: str, total: int) -> Iterator[Bar]:
-            show_rounds(curve, out)
-            with page.progress(label, total) as bar:
-                yield bar
+        rows: list[Row] = []
+
+        def show(row: Row) -> None:
+            rows.append(row)
+            show_rounds(curve, rows, int(rounds.value))
 
         def job() -> str:
             page.device.frame = load_teleop(used.record.robot).frame
             view = page.view(gizmo=True)
             person = Person(device=page.device, view=view, status=page.tell, demonstrates=mine.value)
-            report = dagger(used, out, person=person, resume=out.is_dir(), progress=progress)
-            show_rounds(curve, out)
+            report = dagger(used, out, person=person, report=show, resume=out.is_dir(), progress=page.progress)
             low, high = report["interval"]
             return (
                 f"success {report['success_rate']:.0%} ({low:.0%} to {high:.0%}) after {report['labels']} labels; the "
@@ -133,16 +128,21 @@ def success_plot(page: Page) -> GuiUplotHandle:
         (np.zeros(1), np.zeros(1)),
         (viser.uplot.Series(label="round"), viser.uplot.Series(label="success", stroke="#2563eb", width=2)),
         title="success by round",
-        scales={"x": viser.uplot.Scale(time=False), "y": viser.uplot.Scale(range=(0.0, 1.0))},
+        scales=scales(1),
         aspect=1.8,
         visible=False,
     )
 
 
-def show_rounds(curve: GuiUplotHandle, out: Path) -> None:
-    """Draw what the rounds' reports say."""
-    rows = [json.loads(file.read_text(encoding="utf-8")) for file in sorted(out.glob(f"round_*/{REPORT}"))]
-    shown = [(row["round"], row["success_rate"]) for row in rows if "success_rate" in row]
-    if shown:
-        x, y = np.array(shown, dtype=float).T
-        curve.data, curve.visible = (x, y), True
+def show_rounds(curve: GuiUplotHandle, rows: Sequence[Row], rounds: int) -> None:
+    """Draw the success of each round so far, of a number that there will be."""
+    x, y = np.array([(row["round"], row["success_rate"]) for row in rows], dtype=float).T
+    curve.data, curve.scales, curve.visible = (x, y), scales(rounds - 1), True
+
+
+def scales(last: int) -> dict[str, viser.uplot.Scale]:
+    """Rounds up to the last one, and success; a point at an end is seen whole."""
+    return {
+        "x": viser.uplot.Scale(time=False, range=(-0.1, max(last, 1) + 0.1)),
+        "y": viser.uplot.Scale(range=(-0.05, 1.05)),
+    }

@@ -40,6 +40,7 @@ def dagger(
     most_worlds: int = EVERY_CORE,
     person: Person | None = None,
     watched: Callable[[], Observers] = lambda: unwatched,
+    report: Callable[[Row], None] | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -51,7 +52,8 @@ def dagger(
     the most; the result does not depend on how many. With `resume` a loop goes on wherever it was interrupted, and ends
     with the same policy, bit for bit (on a CPU); it may then also run for more rounds.
 
-    `watched` gives what else watches the episodes of rollouts and of an evaluation that begin.
+    `watched` gives what else watches the episodes of rollouts and of an evaluation that begin, `report` takes
+    each round's row when it has ended.
 
     With gate = "human" a `person` is the expert. Raises `OutputError` when `out` exists, or was made by another recipe,
     `InputError` when the person quits or is missing, and what the stages raise.
@@ -81,12 +83,14 @@ def dagger(
             progress=progress,
         )
         rows.append(one.run())
+        if report is not None:
+            report(rows[-1])
     best = max(rows, key=lambda row: (row.get("judged", 0.0), row["round"]))
-    report = _summed(rows, best) | _final(out, recipes, best, worlds, watched, progress)
+    summed = _summed(rows, best) | _final(out, recipes, best, worlds, watched, progress)
     _hand_over(out, best, overwrite=resume or overwrite)
     plot(rows, out / CURVE)
-    write_json(out / REPORT, report)
-    return report
+    write_json(out / REPORT, summed)
+    return summed
 
 
 def _begin(out: Path, recipes: LoopRecipes, *, resume: bool, overwrite: bool) -> None:
