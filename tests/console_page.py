@@ -18,7 +18,7 @@ from lfd.console.serving import free_port
 from lfd.core.rotations import matrix_from_wxyz
 
 ROOT = Path(__file__).parent.parent
-PATIENCE_MS = 90_000
+PATIENCE_MS = 240_000
 
 
 def need_chromium() -> None:

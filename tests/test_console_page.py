@@ -80,49 +80,6 @@ def test_demonstrate_by_keys_buttons_and_gizmo(console, driver, folder) -> None:
     assert np.ptp(aside.observations["ee_pos"][:, 1]) > 0.03
 
 
-PAD = """
-window.pad = {axes: [0, 0, 0, 0], down: {}};
-window.button = (_, i) => ({value: pad.down[i] || 0, pressed: i in pad.down});
-navigator.getGamepads = () => [null, {axes: pad.axes, buttons: Array.from({length: 17}, button)}];
-"""
-"""A gamepad in the standard layout. Chromium offers tests no way to plug one in: its hardware is played here."""
-UP_TRIGGER, START = 7, 9
-
-
-def test_demonstrate_by_gamepad(console, driver, folder) -> None:
-    driver.open_tab("Demonstrate")
-    driver.fill(successes=1, save_as="padded", **{"longest [s]": 300})
-    driver.press("Begin")
-    driver.wait_for("episode 0: waiting")
-    driver.page.evaluate(PAD)
-
-    def press(button: int, seconds: float) -> None:
-        driver.page.evaluate(f"pad.down = {{{button}: 1}}")
-        driver.page.wait_for_timeout(1e3 * seconds)
-        driver.page.evaluate("pad.down = {}")
-
-    press(START, 0.3)
-    driver.wait_for("episode 0: moving")
-    press(UP_TRIGGER, 1.0)
-    driver.page.wait_for_timeout(500)
-    hand = console.page.device.hand
-    driver.page.evaluate("pad.axes = [0, -1, 0, 0]")
-    driver.page.wait_for_timeout(1000)
-    driver.page.evaluate("navigator.getGamepads = () => [null]")  # unplugged with its stick pushed
-    driver.page.wait_for_timeout(500)
-    stood = hand.position.copy()
-    driver.page.wait_for_timeout(500)
-    np.testing.assert_allclose(hand.position, stood, atol=2e-3)
-    driver.page.evaluate(PAD)
-    driver.page.wait_for_timeout(200)
-    press(START, 0.3)
-    driver.wait_for("1 successes and 0 failures are in padded")
-    driver.page.evaluate("navigator.getGamepads = () => []")
-    went = np.ptp(read_episode(folder / "padded" / "episode_000000.mcap").observations["ee_pos"], axis=0)
-    assert went[2] > 0.02
-    assert max(went[:2]) > 0.02
-
-
 def test_a_dropped_connection_stops_the_arm_and_a_reloaded_page_goes_on(console, driver, folder) -> None:
     driver.open_tab("Demonstrate")
     driver.fill(successes=1, save_as="dropped", **{"longest [s]": 300})
@@ -275,6 +232,49 @@ def test_the_latency_is_shown_on_the_page(console, driver) -> None:
     console.page.show_latency()
     driver.page.wait_for_function("document.querySelector('[data-lfd-latency]').innerText.includes('median')")
     assert driver.latency_ms() == pytest.approx(statistics.median(late), abs=0.6)
+
+
+PAD = """
+window.pad = {axes: [0, 0, 0, 0], down: {}};
+window.button = (_, i) => ({value: pad.down[i] || 0, pressed: i in pad.down});
+navigator.getGamepads = () => [null, {axes: pad.axes, buttons: Array.from({length: 17}, button)}];
+"""
+"""A gamepad in the standard layout. Chromium offers tests no way to plug one in: its hardware is played here."""
+UP_TRIGGER, START = 7, 9
+
+
+def test_demonstrate_by_gamepad(console, driver, folder) -> None:
+    driver.open_tab("Demonstrate")
+    driver.fill(successes=1, save_as="padded", **{"longest [s]": 300})
+    driver.press("Begin")
+    driver.wait_for("episode 0: waiting")
+    driver.page.evaluate(PAD)
+
+    def press(button: int, seconds: float) -> None:
+        driver.page.evaluate(f"pad.down = {{{button}: 1}}")
+        driver.page.wait_for_timeout(1e3 * seconds)
+        driver.page.evaluate("pad.down = {}")
+
+    press(START, 0.3)
+    driver.wait_for("episode 0: moving")
+    press(UP_TRIGGER, 1.0)
+    driver.page.wait_for_timeout(500)
+    hand = console.page.device.hand
+    driver.page.evaluate("pad.axes = [0, -1, 0, 0]")
+    driver.page.wait_for_timeout(1000)
+    driver.page.evaluate("navigator.getGamepads = () => [null]")  # unplugged with its stick pushed
+    driver.page.wait_for_timeout(500)
+    stood = hand.position.copy()
+    driver.page.wait_for_timeout(500)
+    np.testing.assert_allclose(hand.position, stood, atol=2e-3)
+    driver.page.evaluate(PAD)
+    driver.page.wait_for_timeout(200)
+    press(START, 0.3)
+    driver.wait_for("1 successes and 0 failures are in padded")
+    driver.page.evaluate("navigator.getGamepads = () => []")
+    went = np.ptp(read_episode(folder / "padded" / "episode_000000.mcap").observations["ee_pos"], axis=0)
+    assert went[2] > 0.02
+    assert max(went[:2]) > 0.02
 
 
 def test_a_person_pushes_in_a_page_of_the_command_line(driver, tmp_path) -> None:
