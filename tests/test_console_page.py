@@ -282,7 +282,7 @@ def test_a_person_pushes_in_a_page_of_the_command_line(driver, tmp_path) -> None
     with subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         told = next(line for line in process.stderr if "push the arm at" in line)
-        Driver(driver.page, told.split()[-1])
+        Driver(driver.page, told.split()[-1]).drives()
         driver.wait_for("table_distance")
         driver.page.wait_for_timeout(2500)
         driver.hold("f", 1.2)
