@@ -165,7 +165,9 @@ def test_the_policy_does_not_depend_on_the_number_of_worlds(looped, tmp_path) ->
         seen.append([])
         return lambda index: seen[-1].append(index) or ()
 
-    alone = dagger(recipes(), tmp_path / "alone", most_worlds=1, watched=watched)
+    rows: list[dict[str, Any]] = []
+    alone = dagger(recipes(), tmp_path / "alone", most_worlds=1, watched=watched, report=rows.append)
+    assert rows == alone["rounds"]
     assert [len(episodes) for episodes in seen] == [2, 2, 2, 2]  # demonstrations, evaluation, rollouts, evaluation
     assert without_seconds(alone) == without_seconds(report)
     assert weights(tmp_path / "alone" / "policy") == weights(out / "policy")

@@ -232,8 +232,10 @@ def _bench(commands: Commands) -> None:
 def run_bench(given: Namespace) -> Result:
     """Speed, side by side."""
     from lfd.bench.suites import SUITES
+    from lfd.core.artifact import commit
     from lfd.loops.results import write_section
 
+    commit()  # remembered: of the code that runs, before its pictures change the checkout
     measured, sections = SUITES[given.suite](given)
     if given.results is not None:
         command = f"lfd bench {given.suite}" + " --quick" * given.quick + " --full" * given.full

@@ -7,7 +7,8 @@ where no control avoids a crash. So an action is carried out only if, after it, 
 
 for `AHEAD_S`: to stop, or to speed up, on the line where it is, on its first one, or on the road's. Otherwise the
 manoeuvre nearest to the plan that does so from now on is begun, or the one of the greatest distance (compare fail-safe
-trajectories, Pek and Althoff 2018). When people speed up, a way out may be lost; it is looked for again in every step.
+trajectories, Pek and Althoff 2018). It is looked for again in every step. That is no proof: people may speed up, and a
+way out is looked for over `AHEAD_S` only.
 """
 
 from collections.abc import Sequence
@@ -19,8 +20,8 @@ from lfd.worlds.driving_world import ACTION_HIGH, ACTION_LOW, LENGTH, WHEELBASE,
 
 MARGIN_M = 0.3
 """Between outlines [m]."""
-AHEAD_S, STEP_S = 4.0, 0.2
-"""For how long, and in which steps [s]."""
+AHEAD_S = 4.0
+"""For how long [s]."""
 ACCELERATIONS = (-5.0, -2.0, 0.0, 3.0)
 """Of manoeuvres [m/s^2]."""
 DISCS = np.array([-LENGTH / 3.0, 0.0, LENGTH / 3.0]) + WHEELBASE / 2.0
@@ -30,6 +31,7 @@ DISC_M = float(np.hypot(LENGTH / 6.0, WIDTH / 2.0))
 
 
 Number = float | np.ndarray
+"""One, or as many as there are manoeuvres."""
 
 
 def steering_to(line: Number, y: Number, yaw: Number, speed: Number, step_s: float) -> Number:
@@ -42,20 +44,21 @@ def steering_to(line: Number, y: Number, yaw: Number, speed: Number, step_s: flo
 class Manoeuvres:
     """Each acceleration on each line, from where a car is."""
 
-    def __init__(self, car: Car, lines: Sequence[float]):
-        """`lines` are places beside the road's line, y [m]."""
+    def __init__(self, car: Car, lines: Sequence[float], dt: float):
+        """`lines` are places beside the road's line, y [m]; dt is the control step [s]."""
+        self._dt = dt
         acceleration, line = (grid.ravel() for grid in np.meshgrid(ACCELERATIONS, lines, indexing="ij"))
         x, y, yaw, speed = (np.full(len(line), value) for value in (car.x, car.y, car.yaw, car.speed))
         rows = []
-        for number in range(round(AHEAD_S / STEP_S)):
-            steering = steering_to(line, y, yaw, speed, STEP_S)
+        for number in range(round(AHEAD_S / dt)):
+            steering = steering_to(line, y, yaw, speed, dt)
             if number == 0:
                 self.first = np.column_stack([acceleration, steering])
             x, y, yaw, speed = (
-                x + speed * np.cos(yaw) * STEP_S,
-                y + speed * np.sin(yaw) * STEP_S,
-                yaw + speed * np.tan(steering) / WHEELBASE * STEP_S,
-                np.maximum(speed + acceleration * STEP_S, 0.0),
+                x + speed * np.cos(yaw) * dt,
+                y + speed * np.sin(yaw) * dt,
+                yaw + speed * np.tan(steering) / WHEELBASE * dt,
+                np.maximum(speed + acceleration * dt, 0.0),
             )
             rows.append(np.stack([x, y, yaw], axis=-1))
         self._ways = np.stack(rows, axis=1)
@@ -66,7 +69,7 @@ class Manoeuvres:
     def distances(self, others: Sequence[Car]) -> Float[np.ndarray, "M"]:
         """Least distance of each from cars that keep their speed [m]; below 0 where discs overlap."""
         own = discs(self._ways)
-        times = STEP_S * np.arange(1, own.shape[1] + 1)
+        times = self._dt * np.arange(1, own.shape[1] + 1)
         least = np.full(len(own), np.inf)
         for car in others:
             ways = times[:, None] * car.speed * np.array([np.cos(car.yaw), np.sin(car.yaw), 0.0])
@@ -88,9 +91,9 @@ def with_a_way_out(
     """The action, if it leaves a way out, or else one that does."""
     after = robot.moved(float(action[0]), float(action[1]), dt)
     later = [car.moved(0.0, 0.0, dt) for car in others]
-    if Manoeuvres(after, (after.y, first_line, 0.0)).distances(later).max() >= MARGIN_M:
+    if Manoeuvres(after, (after.y, first_line, 0.0), dt).distances(later).max() >= MARGIN_M:
         return action
-    now = Manoeuvres(robot, (robot.y, first_line, 0.0))
+    now = Manoeuvres(robot, (robot.y, first_line, 0.0), dt)
     distances = now.distances(others)
     if distances.max() < MARGIN_M:
         return now.first[int(distances.argmax())]

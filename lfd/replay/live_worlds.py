@@ -130,7 +130,8 @@ class LiveWorlds:
 
     def _tell(self, told: tuple[list[bool], int]) -> tuple[list[bool], int]:
         """Let the curves go on if an episode has ended since `told`, the run's and how many; those of now."""
-        of, ended = self._ended, len(self._ended)
+        of = self._ended  # another run may begin meanwhile
+        ended = len(of)
         if ended > (told[1] if of is told[0] else 0):
             won = sum(of[:ended])
             self._board.tell(dict(zip(RATE, (won / ended, *wilson_interval(won, ended)), strict=True)))
