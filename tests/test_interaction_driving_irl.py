@@ -177,7 +177,9 @@ def test_rewards_that_are_none_are_refused(tmp_path, recorded, lfd_fails) -> Non
     with pytest.raises(InputError, match="unknown type of person 'rude'"):
         DriverOptions(kind="known", learned=(("rude", (0.0,) * 4),)).check()
     out = tmp_path / "x"
-    assert "give --type TYPE" in lfd_fails("irl", "people", "--dataset", recorded, "--out", out)
+    assert "give --type TYPE, one of passive" in lfd_fails("irl", "people", "--dataset", recorded, "--out", out)
+    others = ["--type", "passive", "--features", "speed"]
+    assert "leave them out" in lfd_fails("irl", "people", "--dataset", recorded, "--out", out, *others)
     command = ["irl", "people", "--dataset", recorded, "--out", out, "--type"]
     assert "unknown type of person 'rude'" in lfd_fails(*command, "rude")
     assert "leave none" in lfd_fails(*command, "passive", "--holdout", "14")

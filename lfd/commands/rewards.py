@@ -249,11 +249,14 @@ def run_irl(given: Namespace) -> Result:
 
 def _learn_people(given: Namespace) -> Result:
     """What people are after, from recordings of interactions."""
+    from lfd.interaction.person_reward import LEARNABLE
     from lfd.loops.learning_people import learn_people
     from lfd.terminal import progress_bar
 
-    if given.type is None or given.features or given.reward:
-        raise InputError("lfd irl people has features of its own and learns a reward anew: give --type TYPE instead")
+    if given.features or given.reward:
+        raise InputError("lfd irl people has features of its own and learns a reward anew: leave them out")
+    if given.type is None:
+        raise InputError(f"whose weights are they? give --type TYPE, one of {', '.join(LEARNABLE)}")
     report = learn_people(
         given.dataset, given.type, given.out, holdout=given.holdout, rationality=given.rationality,
         overwrite=given.overwrite, progress=progress_bar,
