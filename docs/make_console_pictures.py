@@ -27,11 +27,15 @@ def demonstrate(page: Page) -> None:
 
 
 def correct(page: Page) -> None:
-    """The arm is pushed down."""
-    _begin(page, "Correct", "cup_tilt")
-    page.wait_for_timeout(2500)
+    """The arm was pushed down, and has learned."""
+    _begin(page, "Correct", "waiting")
+    page.keyboard.press("Enter")
+    _wait(page, "cup_tilt")
+    page.wait_for_timeout(1000)
     page.keyboard.down("f")
-    page.wait_for_timeout(1500)
+    page.wait_for_timeout(1200)
+    page.keyboard.up("f")
+    _wait(page, "cup_tilt -")
 
 
 def compare(page: Page) -> None:

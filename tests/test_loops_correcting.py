@@ -7,9 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lfd.about import about
 from lfd.bench.corrections import PUSH_N, CorrectionsBench, Poke, _noticing, plot, sections_of
 from lfd.cli import main
+from lfd.core.artifact import check_output
 from lfd.core.errors import InputError, RecipeError, UnknownName
+from lfd.experts.device import DeviceState, pushed
+from lfd.experts.keys import Word
 from lfd.loops.correcting import (
     CorrectionRecipe,
     correct,
@@ -21,7 +25,7 @@ from lfd.loops.correcting import (
     start_reward,
     weights_by_push,
 )
-from lfd.loops.correction_results import recorded_person
+from lfd.loops.correction_results import STARTS, Watching, recorded_person
 from lfd.loops.correction_tasks import FEATURES, TASKS
 from lfd.planning.kinematics import GRIPPER, forward
 from lfd.record.episode_file import read_episode
@@ -56,6 +60,12 @@ def test_a_push_teaches_the_one_feature_that_it_was_about(corrected) -> None:
     np.testing.assert_allclose(reward.weights, list(report["weights"][-1].values()), atol=1e-12)
     assert (out.parent / "x.rrd").stat().st_size > 10_000
     assert (out / "reward" / "weights.png").stat().st_size > 5_000
+
+
+def test_corrections_say_what_they_are_and_may_be_replaced(corrected) -> None:
+    facts = about(corrected[0])
+    assert (facts["kind"], facts["recordings"], facts["recipe"]["correct"]["task"]) == ("corrections", 1, "laptop")
+    check_output(corrected[0], overwrite=True)
 
 
 def test_the_reward_can_be_undone_to_what_was_believed_before(corrected) -> None:
@@ -108,6 +118,21 @@ def test_the_arm_yields_to_a_push_and_forgets_it_without_learning(world) -> None
     assert 3.0 < run.noticed_s[0] < 3.06
     assert not run.updates
     np.testing.assert_array_equal(learner.weights, reward.weights)
+
+
+def test_the_arm_stands_until_its_person_says_start(world) -> None:
+    class Hesitant:
+        name, asked = "hesitant", 0
+
+        def read(self) -> DeviceState:
+            self.asked += 1
+            return pushed([("z", -1.0)], [Word.START if self.asked == 3 else Word.GRIPPER])
+
+    told: list[tuple[str, str]] = []
+    device = Hesitant()
+    Watching(None, lambda *said: told.append(said), device).begin(world, {})
+    assert device.asked == 3
+    assert told == [("waiting", STARTS)]
 
 
 def test_a_force_beyond_the_limit_is_clipped_and_said(world) -> None:

@@ -1,9 +1,12 @@
 import json
+from contextlib import AbstractContextManager
 
 import numpy as np
 import pytest
 
+from lfd.core.artifact import check_output
 from lfd.core.errors import RecipeError, UnknownName
+from lfd.core.protocols import Bar
 from lfd.loops.sweep import combinations, rows_of, sweep, title_of
 from tests.conftest import BC, LIFT
 from tests.test_loops_dagger import DAGGER_LIFT
@@ -56,6 +59,16 @@ def test_loops_are_swept_as_well(tmp_path) -> None:
     with pytest.raises(RecipeError, match="a dataset recipe, not a dataset"):
         sweep(recipe, ["train.seed=[0]"], tmp_path, tmp_path / "other")
     assert not (tmp_path / "other").exists()
+
+
+def test_a_sweep_that_was_interrupted_may_be_replaced(thread, tmp_path) -> None:
+    def interrupted(label: str, total: int) -> AbstractContextManager[Bar]:
+        (tmp_path / "out" / "000").mkdir()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep(BC, ["train.seed=[0]"], thread.dataset, tmp_path / "out", progress=interrupted)
+    check_output(tmp_path / "out", overwrite=True)
 
 
 def test_all_combinations_are_made() -> None:

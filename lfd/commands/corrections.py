@@ -77,6 +77,7 @@ def add(commands: Commands) -> None:
 def run_correct(given: Namespace) -> Result:
     """A reward from pushes."""
     from lfd.core.artifact import check_output, sha256
+    from lfd.core.protocols import silent
     from lfd.loops.correcting import CorrectionRecipe, learner_of, set_up, start_reward
     from lfd.loops.correction_results import demonstrate_learned
     from lfd.loops.correction_session import correct_into
@@ -109,7 +110,7 @@ def run_correct(given: Namespace) -> Result:
             seat,
             parents={} if given.reward is None else {str(given.reward): sha256(given.reward)},
             overwrite=given.overwrite,
-            progress=progress_bar,
+            progress=silent if given.person == DEVICE else progress_bar,  # its person's line says how far they are
         )
     if given.save is not None:
         clip = clip_of(given.out / "recordings", 0)
@@ -144,7 +145,7 @@ def _person(given: Namespace, recipe: Any, setup: Any) -> Iterator[Any]:
             person = DevicePerson(device, load_teleop(recipe.robot).frame, load_model(recipe.robot).push_n)
             yield Seat(
                 person,
-                observers=lambda: [Watching(view, status)],
+                observers=lambda: [Watching(view, status, device)],
                 around=lambda policy: Paced(policy, recipe.control_hz),
             )
     elif given.person == CONSOLE:

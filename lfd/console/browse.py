@@ -24,7 +24,10 @@ SHOWN_FACTS = 40
 CARD = "README.md"
 LONGEST_CARD = 4000
 PLAY_HZ = 25.0
-KINDS = ("all", "recordings", "dataset", "policy", "evaluation", "dagger", "reward", "comparison", "interaction")
+KINDS = (
+    "all", "recordings", "dataset", "policy", "evaluation", "dagger", "reward", "corrections", "comparison",
+    "interaction",
+)  # fmt: skip
 
 
 def add_browse(page: Page) -> None:

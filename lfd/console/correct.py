@@ -12,9 +12,10 @@ from viser import GuiUplotHandle
 
 from lfd.console.html import hint
 from lfd.console.page import Page
-from lfd.console.viser_scene import ViserScene
+from lfd.console.viser_scene import EYE, LOOK_AT, ViserScene
 from lfd.core.artifact import sha256
 from lfd.core.protocols import Observation, Observer, Transition, World
+from lfd.experts.keys import Word
 from lfd.experts.pushing import DevicePerson
 from lfd.loops.correcting import CorrectionRecipe, Setup, learner_of, set_up, start_reward
 from lfd.loops.correction_results import Watching
@@ -25,6 +26,8 @@ from lfd.record.pacing import Paced
 from lfd.rewards.reward_artifact import load_reward
 from lfd.worlds.robots import load_model, load_teleop
 
+WIDE_EYE, WIDE_LOOK_AT = (2.0, -0.8, 1.6), (-0.25, 0.0, 1.35)
+"""From where an arm is seen whole that is stretched upwards, as with a tilted cup, and what is in the middle [m]."""
 SHOWN_S = 0.05
 """Time between arrows, and control steps' pictures [s]."""
 PLOTTED_S = 0.25
@@ -33,8 +36,9 @@ LONGEST = 400
 NEW = "what the robot believes at first"
 COLORS = ("#2563eb", "#16a34a", "#ea580c", "#7c3aed")
 HELP = """\
-The arm carries a cup along its plan. Drag a part of it, and it
-is pushed that way: when you let go it has learned, and plans anew. Keys push too: <b>w s a d r f</b>."""
+The arm carries a cup along its plan, from when you say start (<b>Enter</b>). Drag a part of it, and it
+is pushed that way: when you let go it has learned, and plans anew. Keys push too: <b>w s a d r f</b>.
+Grey is its plan, orange what your push makes of it, green the new one."""
 
 
 def add_correct(page: Page) -> None:
@@ -84,6 +88,7 @@ def add_correct(page: Page) -> None:
 
     page.button("Begin", begin, color="blue")
     page.button("Look for rewards", refresh, hint="lists the rewards that are in the folder by now")
+    page.words(Word.START)
     refresh()
 
 
@@ -95,9 +100,10 @@ def seat_at(page: Page, plot: GuiUplotHandle, recipe: CorrectionRecipe, setup: S
     view = page.view(gizmo=False)
     show_shapes(page.scene, setup.planner.scene.shapes)
     page.scene.on_drag(lambda event: _drag(page, event))
+    page.look(WIDE_EYE, WIDE_LOOK_AT)
 
     def observers() -> list[Observer]:
-        return [page.device.hand, Watching(view, page.tell), CorrectionView(page.scene, plot)]
+        return [page.device.hand, Watching(view, page.tell, page.device), CorrectionView(page.scene, plot)]
 
     try:
         yield Seat(
@@ -108,12 +114,14 @@ def seat_at(page: Page, plot: GuiUplotHandle, recipe: CorrectionRecipe, setup: S
     finally:
         page.scene.on_drag(None)
         page.scene.erase()
+        page.look(EYE, LOOK_AT)
 
 
 def add_pushing(page: Page, task: str) -> GuiUplotHandle:
     """What a page needs whose one purpose is a correction; returns its plot of the weights."""
     page.gui.add_html(hint(HELP))
     page.gui.add_html(_told(task))
+    page.words(Word.START)
     return weights_plot(page)
 
 

@@ -1,5 +1,6 @@
 """What comes of corrections: pictures of the weights, pushes of recordings again, datasets of what was learned."""
 
+import time
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from lfd.core.artifact import new_folder
 from lfd.core.errors import InputError
 from lfd.core.protocols import Observation, Progress, Transition, Verdict, World, silent
 from lfd.core.recipe import as_table
+from lfd.experts.device import Device
 from lfd.experts.impedance import Reference
+from lfd.experts.keys import Word
 from lfd.experts.pose_follower import PoseFollower, hand_poses
 from lfd.experts.pushing import NAMES, RecordedPerson
 from lfd.loops.correcting import CorrectionRecipe, set_up
@@ -27,6 +30,7 @@ from lfd.worlds.rollout import rollout
 
 SHOWN_HZ = 20
 """How often a person sees the world, and control steps a second of demonstrations [Hz]."""
+STARTS = "Enter starts, then the arm goes on its way"
 CONVERT = {
     "state": ["joint_pos", "gripper_pos", "ee_pos", "ee_quat"],
     "environment_state": ["cube_pos"],
@@ -41,13 +45,18 @@ DEVIATION_RAD = 0.05
 
 
 class Watching:
-    """An observer that lets a person see the arm while they push it."""
+    """An observer that lets a person see the arm while they push it, and has it stand until they say start."""
 
-    def __init__(self, view: View | None, status: Status):
-        self._view, self._status = view, status
+    def __init__(self, view: View | None, status: Status, device: Device):
+        self._view, self._status, self._device = view, status, device
 
     def begin(self, world: World, observation: Observation) -> None:
         self._every = max(1, round(world.spec.control_hz / SHOWN_HZ))
+        if self._view is not None:
+            self._view.show(world)
+        self._status("waiting", STARTS)
+        while Word.START not in self._device.read().words:
+            time.sleep(1.0 / world.spec.control_hz)
 
     def step(self, world: World, transition: Transition) -> None:
         if transition.step % self._every == 0:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lfd.core.artifact import new_folder, sha256
+from lfd.core.artifact import new_folder, sha256, write_manifest
 from lfd.core.protocols import Observer, Policy, Progress, silent
+from lfd.core.recipe import as_table
 from lfd.experts.pushing import Person
 from lfd.loops.correcting import (
     CorrectionRecipe,
@@ -81,5 +82,8 @@ def correct_into(
                 "weights.png": weights_picture(weights, learned),
                 "report.json": json.dumps(report, indent=2).encode(),
             },
+        )
+        write_manifest(
+            part, kind="corrections", recipe={"correct": as_table(recipe)}, parents=parents, seed=recipe.seed
         )
     return report, learned

@@ -81,6 +81,10 @@ def sweep(
     if "dagger" not in made[0][1]:
         load_frames(source, images=False)
     out.mkdir(parents=True, exist_ok=True)
+    parents = {str(source): sha256(source)}
+    write_manifest(
+        out, kind="sweep", recipe={**load_toml(recipe, LEARN_TABLES), "varied": list(varied)}, parents=parents, seed=0
+    )
     rows: list[dict[str, Any]] = []
     with progress("sweep", len(made)) as bar:
         all_tables = [tables for _, tables in made]
@@ -96,10 +100,6 @@ def sweep(
             bar.advance(note=f"{chosen}: {measured['success_rate']:.0%}")
     rows.sort(key=lambda row: (-row["success_rate"], row["folder"]))
     write_json(out / REPORT, {"rows": rows})
-    parents = {str(source): sha256(source)}
-    write_manifest(
-        out, kind="sweep", recipe={**load_toml(recipe, LEARN_TABLES), "varied": list(varied)}, parents=parents, seed=0
-    )
     return rows
 
 
