@@ -1,14 +1,13 @@
 import numpy as np
 import pytest
 
+from lfd.bench.bootstrap import median_interval, ratio_interval
 from lfd.bench.interaction import InteractionBench, bench_interaction
 from lfd.bench.interaction_report import (
     beliefs,
     comparisons,
     entropy_rows,
-    median_interval,
     plot,
-    ratio_interval,
     sections_of,
 )
 from lfd.loops.interacting import Trial

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from lfd.bench.bootstrap import median_interval, ratio_interval
 from lfd.bench.interaction import CONTROL_HZ, InteractionBench
 from lfd.loops.interacting import Trial, interval, said, summary, told
 
-RESAMPLES = 4000
 MOMENTS_S = (0.4, 1.0, 2.0, 4.0)
 """When the table tells the entropy [s]."""
 SOONER, CERTAIN_IN = 0.7, 0.5
@@ -84,24 +84,6 @@ def comparisons(trials: Mapping[str, Sequence[Trial]]) -> dict[str, str]:
                 f"means {said(ratio_interval(seconds[is_of], others[is_of], np.mean))}, {is_of.sum()} episodes"
             )
     return rows
-
-
-def median_interval(values: Float[np.ndarray, "N"]) -> list[float]:
-    """Median and the ends of its 95% interval by the percentiles of bootstrap samples."""
-    drawn = values[_draws(len(values))]
-    return [float(np.median(values)), *np.percentile(np.median(drawn, axis=1), [2.5, 97.5]).tolist()]
-
-
-def ratio_interval(of: Float[np.ndarray, "N"], to: Float[np.ndarray, "N"], middle: Any) -> list[float]:
-    """Ratio of the middles (`np.mean`, `np.median`) of paired values, with its bootstrap interval."""
-    draws = _draws(len(of))
-    ratios = middle(of[draws], axis=1) / middle(to[draws], axis=1)
-    return [float(middle(of) / middle(to)), *np.percentile(ratios, [2.5, 97.5]).tolist()]
-
-
-def _draws(count: int) -> np.ndarray:
-    """Episodes of each bootstrap sample (RESAMPLES, count)."""
-    return np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
 
 
 def entropy_rows(of: Sequence[Trial]) -> Float[np.ndarray, "N T"]:

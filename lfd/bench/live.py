@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lfd.bench.bootstrap import median_interval, ratio_interval
 from lfd.convert.to_lerobot import convert
 from lfd.core.protocols import Observer, Observers, unwatched
 from lfd.core.recipe import build, load_toml
@@ -37,17 +38,21 @@ SERVER = "--serve-web"
 DEMONSTRATED = Path("datasets/lift_panda.toml")
 LEARNED = Path("policies/bc_mlp.toml")
 DEMONSTRATIONS = 10
+EPISODES = 10
+"""Recorded in a row at full speed."""
 
 
 def bench_live(
     world: RobosuiteWorld, folder: Path, *, pairs: int, episodes: int, gradient_steps: int, seed: int
-) -> dict[str, float]:
+) -> dict[str, list[float]]:
     """What it costs recording, evaluating over `episodes` and training over `gradient_steps` to be watched.
+
+    Medians, with the ends of their 95% intervals where they are of pairs.
 
     Drawing takes the same time of a core however fast the world is, so it is measured on a world that runs in real
     time and has little else to do; at full speed the rest shows, keeping states, in what else is noise.
     """
-    found: dict[str, float] = {}
+    found: dict[str, list[float]] = {}
     with serving() as (_, source), _reader(source, folder / "read.rrd"):
         board = LiveWorlds(RerunBoard(source, "bench", [RATE], scenes=1))
 
@@ -63,10 +68,10 @@ def bench_live(
         for _ in range(pairs):
             (seen, wall), (alone, _) = (recorded(watching, paced=True) for watching in (board.begin(), unwatched))
             of_a_core.append((seen - alone) / wall)
-        found["share of a core for a world that is watched"] = round(float(np.median(of_a_core)), 4)
+        found["share of a core for a world that is watched"] = median_interval(np.array(of_a_core))
         found["processor time of recording at full speed, watched to not"] = _ratio(
-            lambda: recorded(board.begin(), paced=False, times=5),
-            lambda: recorded(unwatched, paced=False, times=5),
+            lambda: recorded(board.begin(), paced=False, times=EPISODES),
+            lambda: recorded(unwatched, paced=False, times=EPISODES),
             pairs,
         )
         policy, dataset = _learned(world, folder, seed)
@@ -86,7 +91,7 @@ def bench_live(
             lambda: _trained(dataset, folder / "alone", gradient_steps, seed),
             pairs,
         )
-    return found | {"to begin [s]": round(max(0.0, first - second), 2)}
+    return found | {"to begin [s]": [max(0.0, first - second)]}
 
 
 def record_random(
@@ -124,17 +129,15 @@ def _trained(
     train(learn["policy"], recipe, dataset, out, tables=learn, report=report, overwrite=True)
 
 
-def _ratio(seen: Callable[[], object], alone: Callable[[], object], pairs: int) -> float:
-    """Processor time of one over that of the other, the median over pairs."""
-    ratios = []
-    for _ in range(pairs):
-        times = []
-        for call in (seen, alone):
+def _ratio(seen: Callable[[], object], alone: Callable[[], object], pairs: int) -> list[float]:
+    """Processor time of one over that of the other, of the medians over pairs; each comes first in every second one."""
+    times = np.empty((pairs, 2))
+    for pair in range(pairs):
+        for which in (0, 1) if pair % 2 == 0 else (1, 0):
             began = _spent()
-            call()
-            times.append(_spent() - began)
-        ratios.append(times[0] / times[1])
-    return round(float(np.median(ratios)), 3)
+            (seen, alone)[which]()
+            times[pair, which] = _spent() - began
+    return ratio_interval(times[:, 0], times[:, 1], np.median)
 
 
 @contextmanager

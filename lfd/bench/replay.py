@@ -47,8 +47,8 @@ class ReplayBench:
     """What is done once for a model in a process, processor time [s]."""
     megabytes: dict[str, float]
     """Kind of episode to the size of its Rerun file [MB]."""
-    live: dict[str, float]
-    """What it costs to be watched."""
+    live: dict[str, list[float]]
+    """What it costs to be watched, with the ends of an interval."""
 
 
 def bench_replay(

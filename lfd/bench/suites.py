@@ -237,6 +237,7 @@ def _interaction(given: Namespace) -> tuple[Measured, Measured]:
 
 
 def _replay(given: Namespace) -> tuple[Measured, Measured]:
+    from lfd.bench.bootstrap import in_words
     from lfd.bench.replay import bench_replay
 
     measured = asdict(
@@ -244,7 +245,7 @@ def _replay(given: Namespace) -> tuple[Measured, Measured]:
             task=given.task,
             robot=given.robot,
             repeats=3 if given.quick else 20,
-            pairs=2 if given.quick else 10,
+            pairs=2 if given.quick else 20,
             episodes=4 if given.quick else 20,
             gradient_steps=100 if given.quick else 2000,
             every_kind=not given.quick,
@@ -255,7 +256,7 @@ def _replay(given: Namespace) -> tuple[Measured, Measured]:
     rows: Measured = {f"recording to Rerun file, {k}": f"{x:g}x real time" for k, x in measured["real_time"].items()}
     rows |= {f"once for a model: {name}": f"{x:g} s" for name, x in measured["once"].items()}
     rows |= {f"size: {kind}": f"{x:g} MB" for kind, x in measured["megabytes"].items()}
-    rows |= {f"--live: {name}": x for name, x in measured["live"].items()}
+    rows |= {f"--live: {name}": in_words(values) for name, values in measured["live"].items()}
     return measured, {f"Replay: {given.task} with {given.robot}": rows}
 
 
