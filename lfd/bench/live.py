@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lfd.bench.bootstrap import median_interval, ratio_interval
+from lfd.bench.bootstrap import median_interval
 from lfd.convert.to_lerobot import convert
 from lfd.core.protocols import Observer, Observers, unwatched
 from lfd.core.recipe import build, load_toml
@@ -38,8 +38,8 @@ SERVER = "--serve-web"
 DEMONSTRATED = Path("datasets/lift_panda.toml")
 LEARNED = Path("policies/bc_mlp.toml")
 DEMONSTRATIONS = 10
-EPISODES = 10
-"""Recorded in a row at full speed."""
+SHORT = 10
+"""Pairs at full speed for each one in real time."""
 
 
 def bench_live(
@@ -56,10 +56,9 @@ def bench_live(
     with serving() as (_, source), _reader(source, folder / "read.rrd"):
         board = LiveWorlds(RerunBoard(source, "bench", [RATE], scenes=1))
 
-        def recorded(observers: Observers, *, paced: bool, times: int = 1) -> tuple[float, float]:
+        def recorded(observers: Observers, *, paced: bool) -> tuple[float, float]:
             began, wall = _spent(), time.perf_counter()
-            for _ in range(times):
-                record_random(world, folder / "live.mcap", seed, observers(0), paced=paced)
+            record_random(world, folder / "live.mcap", seed, observers(0), paced=paced)
             return _spent() - began, time.perf_counter() - wall
 
         first, _ = recorded(board.begin(), paced=False)  # loads the model and sends its shapes
@@ -70,8 +69,8 @@ def bench_live(
             of_a_core.append((seen - alone) / wall)
         found["share of a core for a world that is watched"] = median_interval(np.array(of_a_core))
         found["processor time of recording at full speed, watched to not"] = _ratio(
-            lambda: recorded(board.begin(), paced=False, times=EPISODES),
-            lambda: recorded(unwatched, paced=False, times=EPISODES),
+            lambda: recorded(board.begin(), paced=False),
+            lambda: recorded(unwatched, paced=False),
             pairs,
         )
         policy, dataset = _learned(world, folder, seed)
@@ -130,14 +129,17 @@ def _trained(
 
 
 def _ratio(seen: Callable[[], object], alone: Callable[[], object], pairs: int) -> list[float]:
-    """Processor time of one over that of the other, of the medians over pairs; each comes first in every second one."""
-    times = np.empty((pairs, 2))
-    for pair in range(pairs):
+    """Processor time of one over that of the other, the median over many short pairs, since a machine's speed drifts.
+
+    Each comes first in every second pair.
+    """
+    times = np.empty((SHORT * pairs, 2))
+    for pair in range(SHORT * pairs):
         for which in (0, 1) if pair % 2 == 0 else (1, 0):
             began = _spent()
             (seen, alone)[which]()
             times[pair, which] = _spent() - began
-    return ratio_interval(times[:, 0], times[:, 1], np.median)
+    return median_interval(times[:, 0] / times[:, 1])
 
 
 @contextmanager
