@@ -11,9 +11,9 @@ from lfd.about import about
 from lfd.bench.corrections import PUSH_N, CorrectionsBench, Poke, _noticing, plot, sections_of
 from lfd.cli import main
 from lfd.core.artifact import check_output
-from lfd.core.errors import InputError, RecipeError, UnknownName
+from lfd.core.errors import InputError, LfdError, RecipeError, UnknownName
 from lfd.experts.device import DeviceState, pushed
-from lfd.experts.keys import Word
+from lfd.experts.keys import WAITING, Word
 from lfd.loops.correcting import (
     CorrectionRecipe,
     correct,
@@ -25,7 +25,7 @@ from lfd.loops.correcting import (
     start_reward,
     weights_by_push,
 )
-from lfd.loops.correction_results import STARTS, Watching, recorded_person
+from lfd.loops.correction_results import Watching, recorded_person
 from lfd.loops.correction_tasks import FEATURES, TASKS
 from lfd.planning.kinematics import GRIPPER, forward
 from lfd.record.episode_file import read_episode
@@ -122,17 +122,19 @@ def test_the_arm_yields_to_a_push_and_forgets_it_without_learning(world) -> None
 
 def test_the_arm_stands_until_its_person_says_start(world) -> None:
     class Hesitant:
-        name, asked = "hesitant", 0
+        name = "hesitant"
+
+        def __init__(self, last: Word):
+            self.words = [Word.GRIPPER, Word.GRIPPER, last]
 
         def read(self) -> DeviceState:
-            self.asked += 1
-            return pushed([("z", -1.0)], [Word.START if self.asked == 3 else Word.GRIPPER])
+            return pushed([("z", -1.0)], [self.words.pop(0)])
 
     told: list[tuple[str, str]] = []
-    device = Hesitant()
-    Watching(None, lambda *said: told.append(said), device).begin(world, {})
-    assert device.asked == 3
-    assert told == [("waiting", STARTS)]
+    Watching(None, lambda *said: told.append(said), Hesitant(Word.START)).begin(world, {})
+    assert told == 3 * [("waiting", WAITING)]
+    with pytest.raises(LfdError, match="you quit before the arm went"):
+        Watching(None, lambda *_: None, Hesitant(Word.QUIT)).begin(world, {})
 
 
 def test_a_force_beyond_the_limit_is_clipped_and_said(world) -> None:

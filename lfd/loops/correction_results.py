@@ -1,6 +1,5 @@
 """What comes of corrections: pictures of the weights, pushes of recordings again, datasets of what was learned."""
 
-import time
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -10,19 +9,19 @@ from jaxtyping import Float
 
 from lfd.convert.to_lerobot import convert
 from lfd.core.artifact import new_folder
-from lfd.core.errors import InputError
+from lfd.core.errors import InputError, LfdError
 from lfd.core.protocols import Observation, Progress, Transition, Verdict, World, silent
 from lfd.core.recipe import as_table
 from lfd.experts.device import Device
 from lfd.experts.impedance import Reference
-from lfd.experts.keys import Word
+from lfd.experts.keys import WAITING
 from lfd.experts.pose_follower import PoseFollower, hand_poses
 from lfd.experts.pushing import NAMES, RecordedPerson
 from lfd.loops.correcting import CorrectionRecipe, set_up
 from lfd.loops.plan_demonstrations import TASK, deviate, stand
 from lfd.record.demonstrations import begin_recordings, make_recorder
 from lfd.record.episode_file import read_episode
-from lfd.record.session import Status, View
+from lfd.record.session import Status, View, started
 from lfd.rewards.reward_artifact import LinearReward
 from lfd.worlds.cameras import load_model
 from lfd.worlds.robosuite_world import make_world
@@ -30,7 +29,6 @@ from lfd.worlds.rollout import rollout
 
 SHOWN_HZ = 20
 """How often a person sees the world, and control steps a second of demonstrations [Hz]."""
-STARTS = "Enter starts, then the arm goes on its way"
 CONVERT = {
     "state": ["joint_pos", "gripper_pos", "ee_pos", "ee_quat"],
     "environment_state": ["cube_pos"],
@@ -54,9 +52,8 @@ class Watching:
         self._every = max(1, round(world.spec.control_hz / SHOWN_HZ))
         if self._view is not None:
             self._view.show(world)
-        self._status("waiting", STARTS)
-        while Word.START not in self._device.read().words:
-            time.sleep(1.0 / world.spec.control_hz)
+        if not started(self._device, lambda: self._status("waiting", WAITING), world.spec.control_hz):
+            raise LfdError("you quit before the arm went, and nothing was kept; begin again with fewer --runs")
 
     def step(self, world: World, transition: Transition) -> None:
         if transition.step % self._every == 0:

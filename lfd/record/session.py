@@ -123,6 +123,16 @@ def record_session(
     return sitting.run(first)
 
 
+def started(device: Device, show: Callable[[], None], hz: int) -> bool:
+    """Wait for the person's start, asked for at `hz` [Hz] after each `show`; whether they did not quit instead."""
+    while True:
+        show()
+        words = device.read().words
+        if Word.START in words or Word.QUIT in words:
+            return Word.QUIT not in words
+        time.sleep(1.0 / hz)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sitting:
     """A person at a robot: what they sit before, and what becomes of their episodes."""
@@ -180,12 +190,11 @@ class Sitting:
 
     def _started(self, index: int, told: str) -> bool:
         """Wait for the person's start; whether they did not quit instead."""
-        while True:
+
+        def show() -> None:
             self.status(f"episode {index}: waiting", f"{told}  {WAITING}")
-            words = self.device.read().words
-            if Word.START in words or Word.QUIT in words:
-                return Word.QUIT not in words
-            time.sleep(1.0 / self.world.spec.control_hz)
+
+        return started(self.device, show, self.world.spec.control_hz)
 
     def _episode(self, paced: Paced, index: int, start: WorldState) -> Outcome:
         watching = [self.view] if self.view is not None else []
